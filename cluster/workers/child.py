@@ -28,6 +28,15 @@ class Child:
         """None while it runs."""
         return self._process.poll()
 
+    def is_whole(self) -> bool:
+        """Whether it runs, and so do the processes that it has started; of these only Linux tells at once."""
+        pid = self._process.pid
+        with contextlib.suppress(OSError):
+            for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+                if Path(f"/proc/{child}/stat").read_text().rpartition(") ")[2].startswith("Z"):
+                    return False
+        return self.exit_code() is None
+
     def close(self, patience_s: float) -> None:
         """End it; after `patience_s` kill it, with all that is left in its session. May be called again."""
         assert self._process.stdin

@@ -145,6 +145,7 @@ class RayPool(WorkerPool):
     def _start(self, call: Call) -> None:
         if not self._ray:
             raise PoolError("the pool of workers is closed")
+        self._own.check()
         task = call.task
         bounded(self._maps, task.maps)
         for name in [name for name in dict.fromkeys(task.maps) if name not in self._maps]:

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor, wait
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -97,9 +98,9 @@ class OwnRay:
         except OSError as error:
             raise PoolError(f"Ray cannot be started: {base}: {error.strerror}; {cure}") from None
         with socket.create_server(("127.0.0.1", 0)) as free:
-            unused = free.getsockname()[1]  # Ray Client needs a port, although nobody uses it
+            client = f" --ray-client-server-port={free.getsockname()[1]}" if find_spec("grpc") else ""  # nobody uses it
         flags = f"""--head --block --port=0 --num-cpus={cpus} --num-gpus=0 --object-store-memory={STORE_BYTES}
-            --ray-client-server-port={unused} --dashboard-agent-listen-port=0 --min-worker-port=0 --max-worker-port=0
+            {client} --dashboard-agent-listen-port=0 --min-worker-port=0 --max-worker-port=0
             --include-dashboard=false --include-log-monitor=false --no-monitor --disable-usage-stats --temp-dir"""
         command = [sys.executable, "-P", "-m", "ray.scripts.scripts", "start", *flags.split(), f"{self._folder}/r"]
         log, found = Path(self._folder, "log"), Path(self._folder, "r/ray_current_cluster")
@@ -117,8 +118,8 @@ class OwnRay:
         return address
 
     def check(self) -> None:
-        """Raise PoolError if one of its processes has ended: calls to Ray may then hang, and end us a minute later."""
-        if self._head and self._head.exit_code() is not None:
+        """Raise PoolError if one of its processes has ended: calls to Ray would then hang, or end this process."""
+        if self._head and not self._head.is_whole():
             logs, self._folder = f"{self._folder}/r/session_latest/logs", ""  # which are kept
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 

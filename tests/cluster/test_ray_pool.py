@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil  # type: ignore[import-untyped]
 import pytest
@@ -19,7 +20,7 @@ from driving import to_bytes
 from test_pool import Answering, collect_drive_task, drive_task, make_collect_task, make_recipes, make_task, never_built
 
 from cluster.workers import address, ray_pool
-from cluster.workers.pool import Outcome, PoolError
+from cluster.workers.pool import Call, Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.threads import ThreadPool
 from cluster.workers.worker import CollectTask, Worker
@@ -29,9 +30,7 @@ KILLED = "its process was killed, crashed, or ran out of memory"
 
 
 class Obeying(Answering):
-    """Follows files in a folder: `kill-7` holds how often the member or episode 7 kills its worker, `stop-7` stops it
-    with a signal, `raise-7` fails.
-    """  # fmt: skip
+    """Follows files in a folder: `kill-7` holds how often member or episode 7 kills its worker (or stops it)."""
 
     def __init__(self, folder: Path):
         self._folder = folder
@@ -121,12 +120,12 @@ def test_what_a_lost_worker_held_is_done_by_another(
     before, pid = set(pool.pids()), 0
     (folder / f"{what}-30").write_text("1")
     if calls == "evaluate":
-        call = pool.evaluate(make_task(), make_recipes(512))
-        assert call.results.tobytes() == expected(512)
+        call: Call = (driven := pool.evaluate(make_task(), make_recipes(512)))
+        assert driven.results.tobytes() == expected(512)
     else:
-        call = pool.collect(make_collect_task(400))
+        call = collected = pool.collect(make_collect_task(400))
         with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
-            assert to_bytes(call.experience) == to_bytes(threads.collect(make_collect_task(400)).experience)
+            assert to_bytes(collected.experience) == to_bytes(threads.collect(make_collect_task(400)).experience)
     (said,) = call.warnings
     reason = KILLED if what == "kill" else r"it did not answer for \d+ s \(--patience\)"
     assert re.fullmatch(f"a worker is replaced: {reason}", said)
@@ -231,7 +230,7 @@ def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.M
         pool.open()
 
 
-# --- Clusters, which are joined by processes of their own: Ray reads a token once --------------------------------------
+# --- Clusters, which are joined by processes of their own: Ray reads a token once -------------------------------------
 
 JOIN = """
 import sys, time
@@ -250,7 +249,7 @@ for address in sys.argv[3:]:
 """
 
 
-def join(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.0, **environment: str) -> list[str]:
+def join(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.0, **environment: Any) -> list[str]:
     """What a pool says, of each address."""
     done = finish("python", "-c", JOIN, str(workers), str(patience_s), *addresses, cwd=tmp_path, **environment)
     assert done.stderr == ""
@@ -258,7 +257,7 @@ def join(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.
 
 
 def test_a_cluster_is_joined_with_its_token_and_all_of_its_free_cpus(cluster: Callable, tmp_path: Path) -> None:
-    token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "ab" * 32}
+    token: dict[str, Any] = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "ab" * 32}
     at, _ = cluster(3, **token)
     assert join(tmp_path, 0, at, **token) == ["3 16"]
     assert join(tmp_path, 2, at, **token) == ["2 16"], "the run before has left"
