@@ -8,6 +8,7 @@ run gives the same champion.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
@@ -92,7 +93,8 @@ def train(
         raise
     finally:
         if status == "KILLED":
-            on_event(Event("stopping; a moment ..."))
+            with contextlib.suppress(OSError, SystemExit):  # by rich, if what reads the output has ended, too
+                on_event(Event("stopping; a moment ..."))
         if pool:
             pool.close()
         maps.close()

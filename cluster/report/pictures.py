@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ _ROAD, _WALL = "#4a4e57", "#e9efe6"
 @contextlib.contextmanager
 def plain_style() -> Iterator[None]:
     """Matplotlib's defaults, whatever the user's matplotlibrc says, and names as they are: `$` begins no formula."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that cannot be written to
     import matplotlib
 
     style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "text.parse_math": False}

@@ -182,7 +182,12 @@ def test_a_run_is_looked_for_by_its_id_then_in_its_experiment_alone(uri, tmp_pat
     folder, asked = write_run(tmp_path / "a", 2, success_rate=0.5), []
     _, run_id = send(folder, uri, "mine")
     real = MlflowClient.search_runs
-    monkeypatch.setattr(MlflowClient, "search_runs", lambda self, *a, **k: asked.append(a[0]) or real(self, *a, **k))
+
+    def search(self, *arguments, **keywords):
+        asked.append(arguments[0])
+        return real(self, *arguments, **keywords)
+
+    monkeypatch.setattr(MlflowClient, "search_runs", search)
     monkeypatch.setattr(MlflowClient, "search_experiments", lambda *_, **__: pytest.fail("scans all experiments"))
     assert send(folder, uri, "other") == ("", run_id)
     assert asked == []

@@ -36,7 +36,7 @@ def test_files_that_cannot_be_stored_hold_up_nothing_else(uri, tmp_path, impatie
     sent, report = sync(folder, uri, "driving", read_run)
     assert sent == "2 rows"
     reason = "/.*/mlartifacts.*: (Not a directory|File exists)"
-    assert re.fullmatch(rf"not logged to MLflow at {uri}: 6 files, the model: {reason}", report)
+    assert re.fullmatch(rf"not logged to MLflow at {uri}: 6 files, the model: {reason}", str(report))
     (run,) = runs(uri)
     assert steps(uri, run.info.run_id) == [0]
     assert run.info.status == "FINISHED"
@@ -100,7 +100,9 @@ def test_a_server_that_does_not_answer_costs_seconds(tmp_path, silent, kind):
     reason = "no answer in time" if kind == "silent" else "Connection refused"
     what = "4 rows (step 0 to 3), 6 files, the model, the status FINISHED"
     assert report == f"not logged to MLflow at {uri}: {what}: {reason}"
-    assert sync(tmp_path / "a", uri, "", read_run)[1].startswith("could not upload to MLflow: no MLflow server at ")
+    assert str(sync(tmp_path / "a", uri, "", read_run)[1]).startswith(
+        "could not upload to MLflow: no MLflow server at "
+    )
 
 
 def test_a_sync_that_hangs_is_not_waited_for(uri, tmp_path, monkeypatch):
@@ -126,7 +128,7 @@ def test_a_damaged_file_is_named_and_nothing_is_sent(uri, tmp_path, name, text):
     (folder / name).write_text(text)
     sent, report = sync(folder, uri, "driving", read_run)
     assert sent == ""
-    assert re.fullmatch(rf"could not upload to MLflow at {uri}: {folder / name}.*", report)
+    assert re.fullmatch(rf"could not upload to MLflow at {uri}: {folder / name}.*", str(report))
     assert runs(uri) == []
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tracked import MODEL, client, runs, send, tracking, write_run
+from tracked import MODEL, client, content, runs, send, tracking, write_run
 
 from cluster.store.champion import load_champion
 from cluster.tracking.address import check_uri
@@ -76,7 +76,7 @@ def test_a_champion_is_registered_once_and_the_best_has_an_alias(uri, tmp_path):
 def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
     assert tracking(write_run(tmp_path / "a", 1), uri).close("KILLED") is None
     assert client(uri).search_model_versions() == []
-    assert read_run(tmp_path / "a").files == []
+    assert content(tmp_path / "a").files == []
 
 
 def test_a_registry_that_is_elsewhere_and_away_is_named(uri, tmp_path, monkeypatch, impatient):

@@ -103,7 +103,7 @@ def test_the_folder_holds_no_secret_and_a_resumed_run_finds_it_again(tmp_path, m
     said = run.close("KILLED")
     saved = saved_uri(tmp_path / "a")
     assert saved == redacted(whole) == "postgresql://127.0.0.1:1/db?sslmode=require"
-    assert said.startswith(f"not logged to MLflow at {saved}: 1 row (step 0), the status KILLED: ")
+    assert str(said).startswith(f"not logged to MLflow at {saved}: 1 row (step 0), the status KILLED: ")
     assert not re.search("cret|se/", said + (tmp_path / "a/mlflow.json").read_text())
     assert check_uri(begun_with=saved) == saved
     monkeypatch.setenv("MLFLOW_TRACKING_URI", whole)

@@ -72,6 +72,13 @@ def write_run(folder, count=3, success_rate=None, **flags):
     return folder
 
 
+def content(folder):
+    """What MLflow is to have of a run's folder."""
+    found = read_run(folder)
+    assert found is not None
+    return found
+
+
 def tracking(folder, uri, experiment="driving", read=read_run):
     """A run's tracking, started."""
     started = Tracking(folder, uri, experiment, read)
