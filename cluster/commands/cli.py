@@ -41,12 +41,12 @@ from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.stopping import INTERRUPTED
 from cluster.store.champion import evaluate, load_champion
-from cluster.store.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
-from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run, read_config
+from cluster.store.checkpoint import CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError
+from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run, read_config, write_summary
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import saved_uri, sync
+from cluster.tracking.sync import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
@@ -263,6 +263,9 @@ def _send_missing(console: Console, run: RunFolder, flags: Flags) -> int:
     assert saved is not None
     meta = saved[1]
     sent, unsent = sync(run.path, flags.tracking_uri, flags.experiment, read_run)
+    if sent:  # perhaps MLflow was away as the run ended
+        summary = json.loads((run.path / SUMMARY).read_bytes())
+        write_summary(run.path, summary | {"mlflow_run_id": saved_run_id(run.path)})
     sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
     limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
     more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""

@@ -147,6 +147,11 @@ def sync(folder: Path, uri: str, experiment: str, read: Read, status: Status = "
     return ", ".join(count(number, noun) for noun, number in tracking.sent.items() if number), lacking
 
 
+def saved_run_id(folder: Path) -> str:
+    """MLflow's id of a folder's run; "" if there is none yet."""
+    return str(read_link(folder).get("run_id", ""))
+
+
 def saved_uri(folder: Path) -> str:
     """The address that a folder was last sent to, without its password; "" if there is none."""
     return str(read_link(folder).get("uri", ""))

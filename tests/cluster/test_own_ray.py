@@ -160,6 +160,16 @@ def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("database")
+def test_memory_that_is_full_ends_a_run_in_one_line(tmp_path: Path) -> None:
+    """Ray ends every worker at once, as where another program has filled the memory."""
+    full = {"RAY_memory_usage_threshold": "0.001", "RAY_memory_monitor_refresh_ms": "100"}
+    done = finish("gridsim-evolve", *SMALL, "--workers", "1", "--name", "r", cwd=tmp_path, code=1, **full)
+    (error,) = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert error.endswith("memory is full where it ran; close other programs there, or give fewer --workers")
+
+
+@pytest.mark.e2e
 @pytest.mark.skipif(os.getuid() != 0, reason="makes a network of its own")
 @pytest.mark.usefixtures("database")
 def test_a_network_that_goes_away_is_no_matter(tmp_path: Path) -> None:
