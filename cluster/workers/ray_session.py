@@ -23,7 +23,7 @@ import gridsim
 from cluster import stopping
 from cluster.workers.address import check_address, cluster_address  # noqa: F401 - for those who call this file
 from cluster.workers.child import Child
-from cluster.workers.pool import LOOK_S, PoolError, last_line
+from cluster.workers.pool import LOOK_S, PoolError
 from gridsim.jit import CACHE_FOLDER
 
 PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
@@ -110,7 +110,9 @@ class OwnRay:
 
         while not (address := found.read_text() if found.exists() else ""):
             if head.exit_code() is not None:
-                raise PoolError(f"Ray cannot be started: {last_line(OSError(log.read_text(errors='replace')))}; {cure}")
+                lines = log.read_text(errors="replace").splitlines()
+                said = [line for line in lines if "Error: " in line] or lines or ["its log is empty"]
+                raise PoolError(f"Ray cannot be started: {said[-1].strip()}; {cure}")
             if time.monotonic() > ends:
                 raise PoolError(f"Ray is not up after {patience_s:g} s (--patience), perhaps as this machine is busy")
             stopping.check()
