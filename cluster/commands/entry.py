@@ -64,6 +64,8 @@ def _enter(module: str, name: str) -> None:
         with contextlib.suppress(OSError):
             sys.stdout.flush()
             sys.stderr.flush()
+        if used := sys.modules.get("multiprocessing.util"):
+            used._run_finalizers()  # removes a private folder of kernels (`gridsim.cache`)
         os._exit(int(ended.code or 0))
 
 
