@@ -14,6 +14,7 @@ from typing import Any
 
 from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store.champion import load_champion
+from cluster.store.folder import FILES
 from cluster.tracking.address import TrackingError
 from cluster.tracking.content import Content, Model
 from evolution.networks.export import example
@@ -22,11 +23,6 @@ from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import label
 
 NOT_LOGGED = ("target_m",)  # columns of history.csv that are not metrics
-UPLOADED = (
-    "champion.npz", "champion.onnx", "checkpoint.npz", "config.json", "curves.png", "drive.html", "elites.npz",
-    "history.csv", "summary.json", "trajectory.png",
-)  # fmt: skip
-"""A finished run's files, which MLflow gets; what else is in its folder is the user's own."""
 
 
 def read_run(folder: Path) -> Content | None:
@@ -63,7 +59,7 @@ def read_run(folder: Path) -> Content | None:
         tags=tags(settings),
         note=describe(folder, settings, summary),
         rows=rows,
-        files=[folder / name for name in UPLOADED if (folder / name).is_file()] if summary else [],
+        files=[folder / name for name in FILES if (folder / name).is_file()] if summary else [],
         model=model,
         finished=summary is not None,
         wall_s=rows[-1][2],

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cluster.redaction import one_line, redacted
+from cluster.store.checkpoint import MLFLOW, write_atomic
 from cluster.text import count
 from cluster.tracking.address import TrackingError, is_database, sqlite_path, unreachable
 from cluster.tracking.commit import DIRTY, git_commit
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
-LINK = "mlflow.json"  # file of a folder that says which run of MLflow's it is
 KEY_TAG = "gridsim.key"  # by which a run is found again
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
 """MLflow's tag for the description, and ours for the digest of the one written here; the UI lists neither."""
@@ -327,7 +327,7 @@ def usual_experiment() -> str:
 def read_link(folder: Path) -> dict[str, Any]:
     """What mlflow.json holds: uri, experiment, key, run_id, started; empty without a whole one."""
     try:
-        link = json.loads((folder / LINK).read_bytes())
+        link = json.loads((folder / MLFLOW).read_bytes())
         texts = {type(link[name]) for name in ("uri", "experiment", "key", "run_id")}
         return link if texts == {str} and isinstance(link["started"], float) else {}
     except (OSError, ValueError, LookupError, TypeError):
@@ -335,9 +335,7 @@ def read_link(folder: Path) -> dict[str, Any]:
 
 
 def _write_link(folder: Path, link: dict[str, Any]) -> None:
-    written = folder / f".{LINK}.tmp"
-    written.write_text(json.dumps(link, indent=2) + "\n", encoding="utf-8")
-    os.replace(written, folder / LINK)
+    write_atomic(folder / MLFLOW, (json.dumps(link, indent=2) + "\n").encode(), durable=False)
 
 
 def _size(path: Path) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from cluster import stopping
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.workers.child import Child
+from cluster.workers.pool import LOOK_S
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, trajectory
 from evolution.networks.policy import Observation, PolicySpec
@@ -34,7 +35,6 @@ from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
 PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
-LOOK_S = 0.1  # between two looks at the processes that compile
 
 
 def _marker(settings: RunSettings) -> Path:

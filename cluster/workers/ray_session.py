@@ -21,7 +21,6 @@ import cluster
 import evolution
 import gridsim
 from cluster import stopping
-from cluster.workers.address import check_address, cluster_address  # noqa: F401 - for those who call this file
 from cluster.workers.child import Child
 from cluster.workers.pool import LOOK_S, PoolError
 from gridsim.jit import CACHE_FOLDER
