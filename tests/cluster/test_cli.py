@@ -130,7 +130,8 @@ def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path, mon
 def test_run_folder_and_mlflow_keep_their_contracts(reference):
     home = reference.parent.parent
     stored = {path.name: path.read_bytes() for path in (home / "mlartifacts").rglob("*") if path.is_file()}
-    for name in ("config.json", "champion.npz", "elites.npz", "steps.bin", "curves.png", "trajectory.png", "drive.html"):
+    names = ("config.json", "champion.npz", "elites.npz", "steps.bin", "curves.png", "trajectory.png", "drive.html")
+    for name in names:
         assert stored[name] == (reference / name).read_bytes() > b""
     assert (reference / "checkpoint.npz").is_file()
     figures = summary(reference)
