@@ -2,11 +2,13 @@
 
 import contextlib
 import dataclasses
+import threading
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from commands import wait_until
 from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
@@ -203,13 +205,31 @@ def test_a_call_that_is_stopped_or_replaced_leaves_no_trace(pool: WorkerPool, mo
 # --- Without processes ------------------------------------------------------------------------------------------------
 
 
+class Gated(Answering):
+    """Begins pieces, and ends none before the gate is opened."""
+
+    def __init__(self) -> None:
+        self.begun: list[int] = []
+        self.gate = threading.Event()
+
+    def evaluate(self, task, maps, recipes):
+        self.begun.append(len(recipes))
+        self.gate.wait(60)
+        return super().evaluate(task, maps, recipes)
+
+
 def test_threads_end_within_one_piece_and_leave_the_rest() -> None:
-    pool = ThreadPool(never_built, 2, Answering)
+    worker = Gated()
+    pool = ThreadPool(never_built, 2, lambda: worker)
     call = pool.start(Outcome(make_task(episodes=goals(*[400.0] * 16)), make_recipes(20_000)))
-    for _ in range(2):
-        pool.close()
-    assert call.done == 0
-    assert pool._answers.qsize() < 1000, "of 6,400"
+    wait_until(lambda: len(worker.begun) == 2)
+    closing = threading.Thread(target=pool.close)
+    closing.start()
+    wait_until(lambda: pool._call is None)
+    worker.gate.set()
+    closing.join(60)
+    pool.close()
+    assert (call.done, len(worker.begun)) == (0, 2), "of 6,400 pieces each thread began one"
     with pytest.raises(PoolError, match="or the pool of workers is closed"):
         pool.wait(call, 1.0)
 
