@@ -29,9 +29,8 @@ from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
 from cluster.store.folder import ONNX, RunError, RunFolder, lock, write_summary
 from cluster.store.steps import Steps, write_elites
 from cluster.text import as_argument
-from cluster.tracking.database import silence_mlflow
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import Status, Tracking
+from cluster.tracking.tracking import Status, Tracking
 from cluster.workers import kernels
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
@@ -70,13 +69,13 @@ def train(
     Raises: GridSimError, Stopped, and whatever else ends a run; the last whole step is saved.
     """
     started, settings = perf_counter() if started is None else started, run.settings
-    silence_mlflow()  # before there are threads, as it sets variables
     maps, tracking = Maps(settings.scenario, SimConfig()), Tracking(run.path, place.uri, place.experiment, read_run)
     pool: WorkerPool | None = None
     status: Status = "KILLED"
     try:
         lock(run.path)
         run.write_config()
+        tracking.start()
         if not kernels.is_compiled(settings):
             on_event(Event("compiling the simulator for runs of this kind, once (some 20 s)"))
             kernels.compile_ahead(settings)
@@ -145,7 +144,7 @@ class Session:
             self._steps.write_history(learning.table().tolist(), 0)
         self._state: State | None = None  # after the last step, if it is not saved yet
         self._saved_at = -math.inf
-        self._away = self._tracked = False  # whether an outage of MLflow was reported; whether it is sent anything
+        self._away = False  # whether an outage of MLflow was reported
         self.maps.ahead([*learning.curriculum.map_seeds[:3], *VALIDATION_SEEDS])
 
     def wall_s(self) -> float:
@@ -186,13 +185,6 @@ class Session:
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
         self._steps.write_history(table.tolist(), first)
         self._saved_at = perf_counter()
-        self._track()
-
-    def _track(self) -> None:
-        """Begin to send the run to MLflow, once there is something to send."""
-        if not self._tracked:
-            self._tracked = True
-            self.tracking.start()
 
     def _report_outage(self) -> None:
         """Warn once when MLflow cannot be reached, and once when it is back."""
@@ -210,7 +202,6 @@ class Session:
         from evolution.networks.export import to_onnx
 
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        self._track()
         self.maps.ahead(HELD_OUT_SEEDS)
         self._through(learning.choose_champion())
         best, car_steps, sim = learning.champion, learning.car_steps, learning.sim

@@ -88,6 +88,16 @@ def uri(empty_database: Path, tmp_path: Path) -> str:
 
 
 @pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """MLflow in threads of this process, where a test can disturb it."""
+    from tracked import InThisProcess
+
+    from cluster.tracking import tracking
+
+    monkeypatch.setattr(tracking, "Popen", InThisProcess)
+
+
+@pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short pauses of tracking."""
     from cluster.tracking import address, sync

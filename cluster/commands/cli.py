@@ -46,7 +46,7 @@ from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import saved_run_id, saved_uri, sync
+from cluster.tracking.tracking import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError

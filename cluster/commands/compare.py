@@ -33,7 +33,7 @@ from cluster.redaction import redacted
 from cluster.settings import IN_WORDS, check_workers
 from cluster.store.folder import lock, new_folder
 from cluster.tracking.address import check_uri
-from cluster.tracking.sync import Status, Tracking, saved_uri
+from cluster.tracking.tracking import Status, Tracking, saved_uri
 from cluster.workers import kernels
 from cluster.workers.address import cluster_address
 from gridsim.errors import GridSimError

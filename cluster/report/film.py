@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
 from gridsim.maps.map import Map
 from gridsim.simulator import views
 from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End, X, Y
-from gridsim.view.render import Renderer, interpolate
+
+if TYPE_CHECKING:
+    from gridsim.view.render import Renderer
 
 CODING = {
     # Flat colours compress well: some 3 MB a minute. With the index in front, a browser can start at once.
@@ -79,6 +82,8 @@ def other_cars(worlds: np.ndarray) -> np.ndarray:
 
 def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "") -> np.ndarray:
     """The picture uint8 [h, w, 3] of a drive at a time since its start."""
+    from gridsim.view.render import interpolate  # imports SciPy, which the report does not need
+
     at = min(max(seconds / drive.period, 0.0), len(drive.cars) - 1.0)
     k = min(int(at), len(drive.cars) - 2) if len(drive.cars) > 1 else 0
     following = min(k + 1, len(drive.cars) - 1)

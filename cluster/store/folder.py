@@ -34,7 +34,6 @@ from cluster.store.checkpoint import (
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.files import map_digest
 from gridsim.maps.scenarios import is_map_file, label
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
@@ -116,7 +115,11 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
 
 def _map_sha256(settings: RunSettings) -> str:
     """Digest of the map's file, or "". Raises GridSimError."""
-    return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
+    if not is_map_file(settings.scenario):
+        return ""
+    from gridsim.maps.files import map_digest  # imports SciPy, in 0.2 s
+
+    return map_digest(settings.scenario)
 
 
 def lock(path: Path) -> None:

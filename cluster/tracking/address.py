@@ -97,6 +97,11 @@ def is_database(uri: str) -> bool:
     return address_scheme(uri) in ("sqlite", *_DATABASES)
 
 
+def is_locked(error: str | None) -> bool:
+    """Whether an upload failed only because others write to the database, which ends."""
+    return "database is locked" in (error or "")
+
+
 def with_password(saved: str) -> str:
     """An address of a file or a flag, with the user and password that MLFLOW_TRACKING_URI may have for it."""
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")

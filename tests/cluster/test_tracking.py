@@ -12,10 +12,12 @@ from commands import finish, start, wait_until
 from tracked import MODEL, PYTHONPATH, QUIET, client, read_run, row, runs, send, steps, tracking, write_run
 
 import cluster.tracking.commit
-from cluster.tracking import logged, sync
+from cluster.tracking import logged
 from cluster.tracking.address import check_uri
 from cluster.tracking.content import Content
-from cluster.tracking.sync import Tracking, saved_uri
+from cluster.tracking.tracking import Tracking, saved_uri
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 def test_a_run_read_back(uri, tmp_path, monkeypatch, impatient):
@@ -26,7 +28,7 @@ def test_a_run_read_back(uri, tmp_path, monkeypatch, impatient):
     run_id = run.wait_id(30)
     assert client(uri).get_run(run_id).info.status == "RUNNING"
     write_run(folder, 2000)
-    wait_until(lambda: run.sent["row"] == 2000)
+    wait_until(lambda: run.sent.get("row") == 2000)
     (folder / "notes.txt").write_text("of the user's own")
     write_run(folder, 2000, success_rate=0.95)
     assert run.close("FINISHED") is None
@@ -103,8 +105,7 @@ def test_a_run_that_is_killed_at_any_moment_is_found_again(uri, tmp_path, monkey
             raise SystemExit  # before its id is saved
 
         patch.setattr(MlflowClient, "create_run", create_run)
-        patch.setattr(sync.threading, "excepthook", lambda _: None)
-        tracking(folder, uri)._thread.join()
+        tracking(folder, uri)._listener.join()
     link = json.loads((folder / "mlflow.json").read_text())
     assert link["run_id"] == ""
     (found,) = runs(uri)
@@ -222,7 +223,7 @@ def test_before_its_first_row_a_run_leaves_nothing(tmp_path):
 def test_any_content_can_be_tracked(uri, tmp_path):
     """As a comparison's, which is the parent of its runs, and has no rows at first."""
     content = Content("many runs", {"runs": "2"}, {"kind": "comparison"}, "what it is")
-    parent = tracking(tmp_path, uri, read=lambda _: content)
+    parent = tracking(tmp_path, uri, given=content)
     assert parent.wait_id(30)
     assert parent.close("FINISHED") is None
     run = client(uri).get_run(parent.run_id)

@@ -5,8 +5,10 @@ import http.server
 import os
 import re
 import shutil
+import signal
 import socket
 import sqlite3
+import subprocess
 import threading
 import time
 
@@ -17,7 +19,9 @@ from tracked import PYTHONPATH, QUIET, client, free_port, runs, send, steps, tra
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.description import read_run
 from cluster.tracking.logged import LoggedRun
-from cluster.tracking.sync import sync
+from cluster.tracking.tracking import sync
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 def test_an_experiment_that_was_deleted(uri, tmp_path, impatient):
@@ -106,14 +110,28 @@ def test_a_server_that_does_not_answer_costs_seconds(tmp_path, silent, kind):
 
 
 def test_a_sync_that_hangs_is_not_waited_for(uri, tmp_path, monkeypatch):
-    monkeypatch.setattr("cluster.tracking.sync.STOP_S", 1.0)
+    monkeypatch.setattr("cluster.tracking.tracking.STOP_S", 1.0)
     monkeypatch.setattr(LoggedRun, "send", lambda *_: time.sleep(60))
     run = tracking(write_run(tmp_path / "a", 1), uri)
-    wait_until(lambda: run._thread.is_alive())
     started = time.perf_counter()
-    said = f"not logged to MLflow at {uri}: 1 row (step 0), the status KILLED: no answer within 1 s"
+    said = f"not logged to MLflow at {uri}: 1 row (step 0): no answer within 1 s"
     assert run.close("KILLED") == said
     assert time.perf_counter() - started < 3.0
+
+
+def test_a_process_that_is_killed_is_reported_and_sent_for_later(uri, tmp_path, monkeypatch):
+    monkeypatch.setattr("cluster.tracking.tracking.Popen", subprocess.Popen)
+    run = tracking(write_run(tmp_path / "a", 1), uri)
+    run_id = run.wait_id(60)
+    assert run._process
+    os.kill(run._process.pid, signal.SIGTERM)  # of a whole job, which ends after it
+    write_run(tmp_path / "a", 2)
+    wait_until(lambda: run.sent.get("row") == 2)
+    os.kill(run._process.pid, signal.SIGKILL)
+    wait_until(lambda: run.error)
+    said = f"not logged to MLflow at {uri}: what is new: the process that sends has ended with exit code -9"
+    assert run.close("FINISHED") == said
+    assert send(write_run(tmp_path / "a", 3), uri) == ("1 row", run_id)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +146,7 @@ def test_a_damaged_file_is_named_and_nothing_is_sent(uri, tmp_path, name, text):
     (folder / name).write_text(text)
     sent, report = sync(folder, uri, "driving", read_run)
     assert sent == ""
-    assert re.fullmatch(rf"could not upload to MLflow at {uri}: {folder / name}.*", str(report))
+    assert re.fullmatch(rf"not logged to MLflow at {uri}: what is new in its folder: {folder / name}.*", str(report))
     assert runs(uri) == []
 
 

@@ -7,10 +7,12 @@ from tracked import MODEL, client, content, runs, send, tracking, write_run
 from cluster.store.champion import load_champion
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import sync
+from cluster.tracking.tracking import sync
 from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 @pytest.mark.e2e

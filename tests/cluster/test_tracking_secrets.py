@@ -15,7 +15,9 @@ from tracked import PYTHONPATH, client, free_port, mlflow_server, write_run
 from cluster.redaction import one_line, redacted
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import Tracking, saved_uri, sync
+from cluster.tracking.tracking import Tracking, saved_uri, sync
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,9 @@ from tracked import PYTHONPATH, QUIET, free_port, runs, send, tracking, write_ru
 from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_path, sqlite_uri
 from cluster.tracking.database import create_database, run_tables, silence_mlflow
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import Tracking
+from cluster.tracking.tracking import Tracking
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 
 @pytest.mark.parametrize(

@@ -19,13 +19,15 @@ from tracked import MODEL, free_port, row, send, tracking, write_run
 from cluster.tracking.content import Content
 from cluster.tracking.database import run_tables
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 
 def logged(uri, folder, name, success_rate):
     """A run with three rows, of 83 s; returns what its command says of MLflow in the end."""
     rows = [(step, row(step) | {"validation/success_rate": 0.25 * step}, float(step)) for step in range(3)]
     rows.append((2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0))
     (folder / name).mkdir()
-    begun = tracking(folder / name, uri, "gridsim", lambda _: Content(name, {}, {}, "", rows, wall_s=83.0))
+    begun = tracking(folder / name, uri, "gridsim", Content(name, {}, {}, "", rows, wall_s=83.0))
     assert begun.close("FINISHED") is None
     return begun.where("bin/mlflow")
 

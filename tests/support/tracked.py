@@ -3,23 +3,25 @@
 import contextlib
 import json
 import os
+import queue
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from commands import wait_until
 
+import cluster.tracking.sync
 from cluster.settings import EvolveSettings
 from cluster.store.champion import Champion
-from cluster.tracking import sync
 from cluster.tracking.address import server_problem
 from cluster.tracking.database import silence_mlflow
 from cluster.tracking.description import read_run
-from cluster.tracking.sync import Tracking
+from cluster.tracking.tracking import Tracking, sync
 from evolution.networks.export import to_onnx
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
@@ -28,7 +30,7 @@ NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.5, "collision_rate": 0.5}
 MODEL = "gridsim-curved-evolution"
 # With it scripts find the packages and this file, whatever the working directory.
-PYTHONPATH = os.pathsep.join([str(Path(sync.__file__).resolve().parents[2]), str(Path(__file__).parent)])
+PYTHONPATH = os.pathsep.join([str(Path(cluster.__file__).resolve().parents[1]), str(Path(__file__).parent)])
 
 # A process that tracks a run: arguments are the address, the folder, and one more if all of it has to arrive.
 QUIET = """
@@ -44,6 +46,49 @@ report = run.close("FINISHED")
 assert (report is None) == (len(sys.argv) > 3), report
 assert not [name for name in ("torch", "onnxruntime", "matplotlib") if name in sys.modules]
 """
+
+
+class InThisProcess:
+    """The process of `tracking.py` as threads of this one, whose MLflow a test can disturb."""
+
+    def __init__(self, command, **options):
+        assert command[-1] == "cluster.tracking.sync"
+        silence_mlflow()
+        orders, written = os.pipe()
+        read, answers = os.pipe()
+        self.stdin, self.stdout = os.fdopen(written, "w"), os.fdopen(read)
+        self._orders, self._answers = os.fdopen(orders), os.fdopen(answers, "w", buffering=1)
+        self._lock = threading.Lock()
+        self._ends: queue.SimpleQueue = queue.SimpleQueue()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self):
+        with self._orders:
+            order = json.loads(self._orders.readline())
+            threading.Thread(target=self._serve, args=(order,), daemon=True).start()
+            for line in self._orders:
+                self._ends.put(json.loads(line))
+
+    def _serve(self, order):
+        try:
+            cluster.tracking.sync.serve(order, self._ends, self._tell)
+        except SystemExit:
+            pass
+        except ValueError:  # it was killed
+            assert self._answers.closed
+        finally:
+            self.kill()
+
+    def _tell(self, known):
+        with self._lock:
+            print(json.dumps(known), file=self._answers)
+
+    def kill(self):
+        with self._lock:
+            self._answers.close()
+
+    def wait(self):
+        return 0
 
 
 def row(step):
@@ -72,6 +117,13 @@ def write_run(folder, count=3, success_rate=None, **flags):
     return folder
 
 
+GIVEN: dict = {}
+
+
+def read_given(folder):
+    return GIVEN[folder]
+
+
 def content(folder):
     """What MLflow is to have of a run's folder."""
     found = read_run(folder)
@@ -79,16 +131,17 @@ def content(folder):
     return found
 
 
-def tracking(folder, uri, experiment="driving", read=read_run):
-    """A run's tracking, started."""
-    started = Tracking(folder, uri, experiment, read)
+def tracking(folder, uri, experiment="driving", given=None):
+    """A run's tracking, started; of what is `given`, if it is, in place of the folder's files."""
+    GIVEN[folder] = given
+    started = Tracking(folder, uri, experiment, read_given if given else read_run)
     started.start()
     return started
 
 
 def send(folder, uri, experiment="driving"):
     """Send a folder, of which nothing may be left; returns what was sent, and MLflow's id of the run."""
-    sent, lacking = sync.sync(folder, uri, experiment, read_run)
+    sent, lacking = sync(folder, uri, experiment, read_run)
     assert lacking is None
     return sent, json.loads((folder / "mlflow.json").read_text())["run_id"]
 

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from itertools import combinations, permutations
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from gridsim.maps.lanes import Path, Plan, lay_lanes
 from gridsim.maps.roads import Strips
@@ -25,11 +23,13 @@ def components(edges: np.ndarray) -> np.ndarray:
     Args: edges bool [rows, columns, 4], whether a node's edge in each of DIRECTIONS is open.
     """
     rows, columns, _ = edges.shape
-    index = np.arange(rows * columns).reshape(rows, columns)
-    pairs = [(index, np.roll(index, (-dy, -dx), axis=(0, 1)), edges[..., d]) for d, (dx, dy) in enumerate(DIRECTIONS)]
-    one, other = (np.concatenate([pair[k][pair[2]] for pair in pairs]) for k in (0, 1))
-    joined = coo_array((np.ones(len(one)), (one, other)), shape=(index.size, index.size))
-    return connected_components(joined, directed=False)[1]
+    part, before = np.arange(rows * columns).reshape(rows, columns), None
+    while before is None or (part != before).any():  # the least index spreads over open edges
+        before = part
+        for d, (dx, dy) in enumerate(DIRECTIONS):
+            beyond = np.roll(part, (-dy, -dx), axis=(0, 1))
+            part = np.where(edges[..., d], np.minimum(part, beyond), part)
+    return np.unique(part, return_inverse=True)[1].ravel()
 
 
 def rotated(x: float, y: float, quarters: int) -> tuple[float, float]:
