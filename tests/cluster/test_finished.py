@@ -21,7 +21,7 @@ def test_runs_are_compared_from_python(tmp_path):
     assert first.items() >= read.items()
     assert (second["run"], second["learner"], second["traffic"]) == (str(tmp_path / "b"), "dqn", 0)
     assert set(ERROR_FIGURES) <= set(first)
-    with pytest.raises(GridSimError, match="no such folder"):
+    with pytest.raises(GridSimError, match="not a run's folder"):
         gridsim.compare(tmp_path / "c")
 
 

@@ -1,5 +1,6 @@
 """The live line, as terminals of several widths show it."""
 
+import dataclasses
 import io
 import time
 
@@ -7,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from cluster.commands import progress
-from cluster.commands.progress import Display, Progress, progress_in_words
+from cluster.commands.progress import Display, RunDisplay
 from cluster.learn.learning import Event
 from cluster.settings import DqnSettings, EvolveSettings
 
@@ -21,7 +22,7 @@ WIDTHS = [60, 80, 120]
 
 def display(settings, width, terminal=True):
     console = Console(width=width, force_terminal=terminal, color_system=None, file=io.StringIO())
-    return Progress(console, settings), console
+    return RunDisplay(console, settings), console
 
 
 def drawn(shown, width):
@@ -93,12 +94,14 @@ def test_each_learners_rows_are_said_in_words():
     row = {**ROW, "loss": 0.0123, "network/success_rate": 0.5, "updates": 1500.0, "episodes": 1e4}
     dqn = DqnSettings("curved", car_steps=0, episodes=20_000)
     assert progress.row_in_words(dqn, 2, row) == "distance 1,812 m, 50% succeed  7.1 m/s  loss 0.012  2 k updates"
-    assert progress_in_words(dqn, 2, row) == "10000/20000 episodes"
-    assert progress_in_words(BY_CAR_STEPS, 2, ROW, bounded=False) == "12.3 M car-steps"
+    assert progress._progress(dqn, 2, row) == (0.5, "10000/20000 episodes")
+    both = EvolveSettings("curved", car_steps=30_000_000, generations=10**15)
+    assert progress._progress(both, 2, ROW)[1] == "12.3/30 M car-steps"
+    assert progress._progress(dataclasses.replace(both, car_steps=0), 2, ROW) == (0.0, "2 generations")
 
 
 def test_a_terminal_shows_it_live():
     file = io.StringIO()
-    with Display(Console(width=40, force_terminal=True, color_system=None, file=file)) as line:
+    with Display(Console(width=60, force_terminal=True, color_system=None, file=file)) as line:
         line.head, line.facts, line.rest = "12/30 generations", "success 37%", "240 generations"
-    assert "12/30 generations  success 37%  \n240 generations" in file.getvalue()
+    assert "12/30 generations  success 37%  ━━━━━━━━━━  0:00\n240 generations" in file.getvalue()

@@ -73,7 +73,7 @@ def test_runs_of_different_traffic_and_views_are_not_mixed():
 @pytest.mark.parametrize("plan", [None, PLAN])
 def test_the_terminal_shows_the_tables(tmp_path, plan):
     shown = io.StringIO()
-    _print(Console(width=80, file=shown), tmp_path, tables.group(RUNS, plan), plan)
+    _print(Console(width=80, file=shown), tmp_path, RUNS, plan)
     text = shown.getvalue()
     assert max(map(len, text.splitlines()[:-1])) <= 80
     for word in ("evolution", "90", "15.0", "Fewer than 3 seeds are too few for a verdict."):
