@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -99,30 +100,27 @@ def _compare() -> int:
     common.warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
     shared = {
         "workers": flags.workers, "address": address or "local", "patience": flags.patience,
-        "wall-time": wall_s or MAX_WALL_S,  # with a limit, the time of a run counts from its first step
-        "tracking-uri": redacted(uri), "experiment": flags.experiment,
+        "wall_time": wall_s or MAX_WALL_S,  # with a limit, the time of a run counts from its first step
+        "tracking_uri": redacted(uri), "experiment": flags.experiment,
     }  # fmt: skip
     stopping.listen()
     write_plan(path, plan)
     tracking = Tracking(path, uri, flags.experiment, report.read_comparison)
-    again, problem = f"{command_path(PROG)} --resume {short_path(path)}", ""
+    again = f"{command_path(PROG)} --resume {short_path(path)}"
     status: Status = "FINISHED"
     try:
-        tracking.start()
-        work.train(tracking, shared)
+        with contextlib.closing(work), work.display:
+            tracking.start()
+            work.train(tracking, shared)
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         status = "KILLED"
-        common.new_console(stderr=True).print("stopping; runs are being saved ...", style="dim")
-    except (GridSimError, MemoryError, OSError) as error:
-        problem, status = str(error) or type(error).__name__, "FAILED"
-    finally:
-        work.stop()
-    if work.runs and not problem:
+    except (GridSimError, OSError) as error:
+        tracking.close("FAILED")
+        fail(PROG, str(error), f"continue with: {again}", common.FAILED)
+    if work.runs:
         report.write(path, work.runs, plan)
     if unsent := tracking.close(status):
         _warn(f"{unsent}; send it later with: {again}")
-    if problem:
-        fail(PROG, problem, f"continue with: {again}", common.FAILED)
     if work.runs:
         _print(work.console, path, work.runs, plan)
     work.console.print(f"compare: {tracking.where(command_path('mlflow'))}", soft_wrap=True)
@@ -144,7 +142,7 @@ class Work:
         self.console = common.new_console()
         self.planned, self.runs, self.failed = plan.planned(path), list[Run](), 0
         self.waiting = deque(run for run in self.planned if not (is_finished(run) and is_sent(run)))
-        self._path, self._plan, self._jobs, self._shown = path, plan, jobs, Display(self.console)
+        self._path, self._plan, self._jobs, self.display = path, plan, jobs, Display(self.console)
         self._running = list[tuple[RunFolder, Popen[bytes]]]()
         self._ends_at = math.nan  # `perf_counter`, as far as it can be told
 
@@ -153,33 +151,34 @@ class Work:
         total, left = len(self.planned), len(self.waiting)
         finished = f", {total - left} of them finished" if left < total else ""
         self.console.print(f"comparing {total} runs{finished} -> {short_path(self._path)}", soft_wrap=True)
-        with self._shown:
-            for run in self.planned:
-                if run not in self.waiting:
-                    self._take_in(run)
-            environment = {"MLFLOW_TRACKING_URI": tracking.uri}  # with its password, which no flag may hold
-            if self.waiting:
-                self._show("waiting for MLflow")
-                if parent := tracking.wait_id(WAIT_FOR_MLFLOW_S):
-                    environment["MLFLOW_RUN_CONTEXT"] = json.dumps({"mlflow.parentRunId": parent})
-            began = time.perf_counter()
-            self._ends_at = began + (limits(self._plan.budget)[1] or math.nan) * left / self._jobs
-            while self.waiting or self._running:
-                while self.waiting and len(self._running) < self._jobs:
-                    run = self.waiting.popleft()
-                    self._running.append((run, start(run, flags, environment)))
-                self._show(*(f"{run.name}  {last_line(run)}" for run, _ in self._running))
-                time.sleep(LOOK_S)
-                stopping.check()
-                for run, process in [each for each in self._running if each[1].poll() is not None]:
-                    self._running.remove((run, process))
-                    _repeat(run)
-                    now, to_do = time.perf_counter(), len(self.waiting) + len(self._running)
-                    self._ends_at = now + to_do * (now - began) / (left - to_do)
-                    self._take_in(run, process.returncode)
+        for run in self.planned:
+            if run not in self.waiting:
+                self._take_in(run)
+        environment = {"MLFLOW_TRACKING_URI": tracking.uri}  # with its password, which no flag may hold
+        if self.waiting:
+            self._show("waiting for MLflow")
+            if parent := tracking.wait_id(WAIT_FOR_MLFLOW_S):
+                environment["MLFLOW_RUN_CONTEXT"] = json.dumps({"mlflow.parentRunId": parent})
+        began = time.perf_counter()
+        self._ends_at = began + (limits(self._plan.budget)[1] or math.nan) * left / self._jobs
+        while self.waiting or self._running:
+            while self.waiting and len(self._running) < self._jobs:
+                run = self.waiting.popleft()
+                self._running.append((run, start(run, flags, environment)))
+            self._show(*(f"{run.name}  {last_line(run)}" for run, _ in self._running))
+            time.sleep(LOOK_S)
+            stopping.check()
+            for run, process in [each for each in self._running if each[1].poll() is not None]:
+                self._running.remove((run, process))
+                _repeat(run)
+                now, to_do = time.perf_counter(), len(self.waiting) + len(self._running)
+                self._ends_at = now + to_do * (now - began) / (left - to_do)
+                self._take_in(run, process.returncode)
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Ask what is running to save and to end, and wait until it has."""
+        if self._running:
+            common.new_console(stderr=True).print("stopping; runs are being saved ...", style="dim")
         for _, process in self._running:
             process.terminate()
         for run, process in self._running:
@@ -194,8 +193,8 @@ class Work:
                 raise GridSimError(f"its process ended with exit code {code}; see {short_path(log_of(planned))}")
             run = read_run(planned.path)
             if run.settings != planned.settings:
-                reason = "one of them was edited, or another version of GridSim wrote it; start a new comparison"
-                raise GridSimError(f"{planned.path} is not what comparison.json asks for: {reason}")
+                what = f"{planned.path} is not what comparison.json asks for"
+                raise GridSimError(f"{what}; was it edited, or made by another version? Start a new comparison")
             self.runs.append(measured(run))
         except GridSimError as error:
             self.failed += 1
@@ -204,9 +203,9 @@ class Work:
         report.write_tables(self._path, self.runs, self._plan)
         figures = self.runs[-1].figures
         self.console.print(
-            f"{self._shown.head}  {planned.name}: success {figures['success_rate']:.0%}, "
+            f"{self.display.head}  {planned.name}: success {figures['success_rate']:.0%}, "
             f"{figures['distance_m']:,.0f} m, velocity error {figures['velocity_error_percent']:.1f} %, "
-            f"{figures['training_s']:.0f} s  {self._shown.facts}",
+            f"{figures['training_s']:.0f} s  {self.display.facts}",
             soft_wrap=True, highlight=False,
         )  # fmt: skip
 
@@ -214,9 +213,9 @@ class Work:
         """Show these lines under how many runs are done, and when all will be."""
         total, seconds = len(self.planned), self._ends_at - time.perf_counter()
         done = total - len(self.waiting) - len(self._running)
-        self._shown.head, self._shown.share = f"run {done}/{total}", done / total
-        self._shown.facts = f"ETA {clock(max(seconds, 0.0)) if math.isfinite(seconds) else '-:--'}"
-        self._shown.rest = "\n".join(lines)
+        self.display.head, self.display.share = f"run {done}/{total}", done / total
+        self.display.facts = f"ETA {clock(max(seconds, 0.0)) if math.isfinite(seconds) else '-:--'}"
+        self.display.rest = "\n".join(lines)
 
 
 def _repeat(run: RunFolder) -> None:

@@ -51,8 +51,7 @@ class RunDisplay(Display):
         if event.warning:
             print(f"{self._settings.command}: warning: {event.text}", file=sys.stderr, flush=True)
         elif event.total:
-            done = min(event.done, event.total)
-            self.rest = f"{event.text} {done:{len(str(event.total))}}/{event.total}  {self._row}"
+            self.rest = f"{event.text} {event.done:{len(str(event.total))}}/{event.total}  {self._row}"
         else:
             self.rest = event.text
             if not self.console.is_terminal:

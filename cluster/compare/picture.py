@@ -38,10 +38,8 @@ def comparison(groups: Groups, path: Path) -> None:
             beside = (np.arange(len(values)) - (len(values) - 1) / 2) / max(len(values), 1)  # side by side
             axis.plot(place + 0.5 * width * beside, scale * np.array(values), "o", markersize=3.5, color="white",
                       markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
-        axis.set_title(title)
+        axis.set(title=title, xlim=(-0.5, len(roads) - 0.5), ylim=(0.0, None))
         axis.set_xticks(range(len(roads)), map(drawable, roads))
-        axis.set_xlim(-0.5, len(roads) - 0.5)
-        axis.set_ylim(bottom=0.0)
         axis.grid(axis="y", alpha=0.25, zorder=0)
         axis.spines[["top", "right"]].set_visible(False)
     figure.legend(

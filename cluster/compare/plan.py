@@ -71,14 +71,13 @@ class Plan:
 
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
-        for flag, given in (("scenarios", self.scenarios), ("learners", self.learners)):
-            if not given or len(set(given)) != len(given):
-                raise GridSimError(f"--{flag} {' '.join(given)}: name at least one, and each once")
+        if not self.scenarios or not self.learners:
+            raise GridSimError("--scenarios, --learners: name at least one of each")
         if not 1 <= self.seeds <= MAX_SEEDS:
             raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         runs = dataclasses.replace(self, seeds=1).planned(Path())
         if len({run.name for run in runs}) != len(runs):
-            raise GridSimError("two runs would have the same name: rename a map, or name a value of --grid once")
+            raise GridSimError("two runs would have the same name: name all once, also in --grid, or rename a map")
         # The DQN's settings hold neither --population nor --generations.
         for settings in (self.settings(self.scenarios[0], "evolution", 0), *(run.settings for run in runs)):
             settings.check()
@@ -181,7 +180,7 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
 
     Raises: GridSimError.
     """
-    paths: dict[Path, Path] = {}  # as they are given, by what they resolve to
+    paths: list[Path] = []
     for folder in folders:
         of_folder = [folder]
         if (folder / COMPARISON).is_file():
@@ -189,6 +188,5 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
             if not of_folder:
                 again = f"continue it with --resume {as_argument(folder)}"
                 raise GridSimError(f"{folder}: none of its runs is finished; {again}")
-        for path in of_folder:
-            paths.setdefault(path.resolve(), path)
-    return [read_run(path) for path in paths.values()]
+        paths += of_folder
+    return list({path.resolve(): read_run(path) for path in paths}.values())

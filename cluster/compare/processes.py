@@ -25,6 +25,12 @@ if os.getppid() == int(sys.argv[1]):
     os.execvp(sys.argv[2], sys.argv[2:])"""
 
 
+def flags_of(run: RunFolder, **more: object) -> list[str]:
+    """Flags with which the learner's command makes a run, and more of them by name."""
+    flags = {**vars(run.settings), "output": run.path.parent, "name": run.name, **more}
+    return [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
+
+
 def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
     """Start the process that trains a run, whether it was begun or not; what it prints is in its log.
 
@@ -32,8 +38,7 @@ def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str,
     """
     folders = Path(sys.argv[0]).parent, Path(sys.executable).parent  # this program's, and Python's
     script = shutil.which(run.settings.command, path=os.pathsep.join(map(str, folders))) or run.settings.command
-    flags = {**vars(run.settings), "output": run.path.parent, "name": run.name, **flags}
-    command = [script, "--resume-if-exists", *(f"--{name.replace('_', '-')}={value}" for name, value in flags.items())]
+    command = [script, "--resume-if-exists", *flags_of(run, **flags)]
     if sys.platform == "linux":
         command = [sys.executable, "-ISc", WITH_PARENT, str(os.getpid()), *command]
     log_of(run).parent.mkdir(exist_ok=True)

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from finished_runs import run
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
@@ -20,16 +18,10 @@ from cluster.compare.plan import Plan
 from cluster.compare.report import page
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
-RUNS = [run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "seamless", 0, 5.0)]
-
-
-@given(st.lists(st.integers(-100, 100), min_size=2, max_size=6))
-def test_medians_lie_between_quartiles(values):
-    made = [run("evolution", "curved", seed, value) for seed, value in enumerate([*values, math.nan, math.inf])]
-    (rows,) = tables.group(made).values()
-    found, (lower, median, upper) = tables.quartiles(rows, "velocity_error_percent")
-    assert (found, median) == (values, np.median(values))
-    assert min(values) <= lower <= median <= upper <= max(values)
+RUNS = [
+    run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "curved", 1, math.nan),
+    run("random", "seamless", 0, 5.0),
+]  # fmt: skip
 
 
 def test_tables_show_what_is_missing():
@@ -39,13 +31,12 @@ def test_tables_show_what_is_missing():
     (_, *driving), (_, *errors) = (tables.table(groups, columns) for columns in (tables.DRIVING, tables.ERRORS))
     assert [line[:3] for line in driving] == [
         ["curved", "evolution", "2"],
-        ["curved", "random search", "missing"],
+        ["curved", "random search", "1 of 2"],
         ["seamless", "evolution", "missing"],
         ["seamless", "random search", "1 of 2"],
     ]
-    assert errors[0][4] == "15.0 (12.5 to 17.5)"
-    assert set(errors[1][3:]) == {"–"}
-    assert errors[3][4] == "5.0"
+    assert set(errors[2][3:]) == {"–"}
+    assert [line[4] for line in errors] == ["15.0 (12.5 to 17.5)", "–", "–", "5.0"]
     rows = list(csv.DictReader(io.StringIO(tables.table_csv(groups, Path()).decode())))
     assert [row["velocity_error_percent"] for row in rows] == ["10.0", "20.0", "", "", "", "", "5.0", ""]
     assert [(row["learner"], row["seed"]) for row in rows[2:4]] == [("random", "0"), ("random", "1")]
