@@ -154,11 +154,12 @@ class Work:
         for run in self.planned:
             if run not in self.waiting:
                 self._take_in(run)
-        environment = {"MLFLOW_TRACKING_URI": tracking.uri}  # with its password, which no flag may hold
-        if self.waiting:
-            self._show("waiting for MLflow")
-            if parent := tracking.wait_id(WAIT_FOR_MLFLOW_S):
-                environment["MLFLOW_RUN_CONTEXT"] = json.dumps({"mlflow.parentRunId": parent})
+        self._show("waiting for MLflow")
+        parent = tracking.wait_id(WAIT_FOR_MLFLOW_S) if self.waiting else ""
+        environment = {
+            "MLFLOW_TRACKING_URI": tracking.uri,  # with its password, which no flag may hold
+            "MLFLOW_RUN_CONTEXT": json.dumps({"mlflow.parentRunId": parent} if parent else {}),
+        }
         began = time.perf_counter()
         self._ends_at = began + (limits(self._plan.budget)[1] or math.nan) * left / self._jobs
         while self.waiting or self._running:

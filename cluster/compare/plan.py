@@ -103,9 +103,10 @@ class Plan:
                 what = f"{learner} has no such setting, or the comparison sets it"
                 raise GridSimError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
             kind = type(usual[name])
-            try:  # a word, such as mlp:6,7, may have commas, and begins with a letter
-                choices.append([(name, kind(word)) for word in re.split(",(?=[a-z])" if kind is str else ",", values)])
-            except ValueError:
+            words = re.split(",(?=[a-z])" if kind is str else ",", values)  # mlp:6,7 is one word
+            try:
+                choices.append([(name, kind(float(word)) if kind is int else kind(word)) for word in words])
+            except (ValueError, OverflowError):
                 raise GridSimError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
         return [dict(chosen) for chosen in itertools.product(*choices)]
 

@@ -123,6 +123,9 @@ def test_a_run_gets_the_password_and_the_parent_of_its_mlflow_run_in_its_environ
     assert environment == 'hunter2@h:5000 {"mlflow.parentRunId": "17"}\n'
     for flag in ("wall-time=90.0", "patience=7.0", "workers=1", "experiment=mine", "tracking-uri=http://h:5000"):
         assert f" --{flag} " in f"{flags} "
+    made.tracking.wait_id.return_value = ""
+    made.run(*budget, "--name", "d")
+    assert (tmp_path / "asked").read_text().endswith(" {}\n"), "its runs do not probe MLflow again"
 
 
 def test_what_mlflow_lacks_of_a_finished_run_is_sent_as_the_comparison_is_resumed(tmp_path, made):
