@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import math
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from cluster.commands import common
 from cluster.commands.common import WorkFlags, command_path, fail, short_path
 from cluster.commands.progress import Display, clock
 from cluster.compare import report, tables
-from cluster.compare.plan import MAX_WALL_S, Plan, is_finished, limits, read_plan, read_runs, write_plan
+from cluster.compare.plan import MAX_WALL_S, Plan, is_finished, limits, read_finished, read_plan, read_runs, write_plan
 from cluster.compare.processes import is_sent, last_line, log_of, said, start
 from cluster.compare.results import Run, measured, read_run
 from cluster.redaction import redacted
@@ -75,10 +74,16 @@ LOOK_S = 0.2  # between two looks at the runs' processes
 
 
 def _compare() -> int:
-    arguments = sys.argv[1:]
+    arguments, console = sys.argv[1:], common.new_console()
     flags = common.parse(CompareFlags, PROG, arguments, QUICK if "--quick" in arguments else None)
     if flags.runs:
-        return _compare_finished(flags)
+        for f in dataclasses.fields(flags):
+            if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(CompareFlags(), f.name):
+                raise GridSimError(f"{common.as_flag(f.name)}: finished runs are compared as they are; leave it out")
+        runs = read_runs(map(Path, flags.runs))
+        path = new_folder(Path(flags.output), flags.name, "comparison")
+        path.mkdir(parents=True)
+        return common.FAILED if _report(console, path, runs, None) else 0
     check_workers(flags.workers, flags.patience)
     if not 1 <= flags.jobs <= MAX_JOBS:
         raise GridSimError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
@@ -91,9 +96,10 @@ def _compare() -> int:
         path = new_folder(Path(flags.output), flags.name, "comparison")
     plan = common.select(Plan, flags)
     plan.check()
+    total, done = len(plan.planned(path)), len(read_finished(path, plan))
+    left = [run for run in plan.planned(path) if not (is_finished(run) and is_sent(run))]
     uri, wall_s = check_uri(flags.tracking_uri, saved_uri(path)), limits(plan.budget)[1]
-    work = Work(path, plan, flags.jobs)
-    address = cluster_address(flags.address) if work.waiting else None
+    address = cluster_address(flags.address) if left else None
     lock(path)
     if flags.jobs > 1 and wall_s:
         _warn("runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps")
@@ -105,118 +111,81 @@ def _compare() -> int:
     }  # fmt: skip
     stopping.listen()
     write_plan(path, plan)
+    console.print(f"comparing {total} runs, {done} of them finished -> {short_path(path)}", soft_wrap=True)
     tracking = Tracking(path, uri, flags.experiment, report.read_comparison)
     again = f"{command_path(PROG)} --resume {short_path(path)}"
     status: Status = "FINISHED"
+    failed = 0
     try:
-        with contextlib.closing(work), work.display:
-            tracking.start()
-            work.train(tracking, shared)
+        tracking.start()
+        if left:
+            with console.status("waiting for MLflow"):
+                parent = tracking.wait_id(WAIT_FOR_MLFLOW_S)
+            environment = {
+                "MLFLOW_TRACKING_URI": tracking.uri,  # with its password, which no flag may hold
+                "MLFLOW_RUN_CONTEXT": json.dumps({"mlflow.parentRunId": parent} if parent else {}),
+            }
+            failed = _train(console, left, total, flags.jobs, partial(start, flags=shared, environment=environment))
+        failed += _report(console, path, read_finished(path, plan), plan)
+        stopping.check()
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         status = "KILLED"
     except (GridSimError, OSError) as error:
         tracking.close("FAILED")
         fail(PROG, str(error), f"continue with: {again}", common.FAILED)
-    if work.runs:
-        report.write(path, work.runs, plan)
     if unsent := tracking.close(status):
         _warn(f"{unsent}; send it later with: {again}")
-    if work.runs:
-        _print(work.console, path, work.runs, plan)
-    work.console.print(f"compare: {tracking.where(command_path('mlflow'))}", soft_wrap=True)
+    console.print(f"compare: {tracking.where(command_path('mlflow'))}", soft_wrap=True)
     if status == "KILLED":
         print(f"{PROG}: stopped; continue with: {again}", file=sys.stderr)
         return stopping.INTERRUPTED
-    if work.failed:
-        fail(PROG, f"{work.failed} of {len(work.planned)} runs failed", f"continue with: {again}", common.FAILED)
+    if failed:
+        fail(PROG, f"{failed} of {total} runs failed", f"continue with: {again}", common.FAILED)
     return 0
 
 
-class Work:
-    """Trains what is left of a comparison, so many runs at once as `jobs` says, and reads and measures all runs.
+def _train(
+    console: Console, left: Sequence[RunFolder], total: int, jobs: int, start: Callable[[RunFolder], Popen[bytes]]
+) -> int:
+    """Train the runs that are left of all, so many at once, until a signal comes; a run that fails stops no other.
 
-    A run that fails does not stop the others.
+    Returns: how many failed.
     """
-
-    def __init__(self, path: Path, plan: Plan, jobs: int):
-        self.console = common.new_console()
-        self.planned, self.runs, self.failed = plan.planned(path), list[Run](), 0
-        self.waiting = deque(run for run in self.planned if not (is_finished(run) and is_sent(run)))
-        self._path, self._plan, self._jobs, self.display = path, plan, jobs, Display(self.console)
-        self._running = list[tuple[RunFolder, Popen[bytes]]]()
-        self._ends_at = math.nan  # `perf_counter`, as far as it can be told
-
-    def train(self, tracking: Tracking, flags: Mapping[str, object]) -> None:
-        """Train what is left, with these flags besides those of each run. Raises: Stopped, OSError."""
-        total, left = len(self.planned), len(self.waiting)
-        finished = f", {total - left} of them finished" if left < total else ""
-        self.console.print(f"comparing {total} runs{finished} -> {short_path(self._path)}", soft_wrap=True)
-        for run in self.planned:
-            if run not in self.waiting:
-                self._take_in(run)
-        self._show("waiting for MLflow")
-        parent = tracking.wait_id(WAIT_FOR_MLFLOW_S) if self.waiting else ""
-        environment = {
-            "MLFLOW_TRACKING_URI": tracking.uri,  # with its password, which no flag may hold
-            "MLFLOW_RUN_CONTEXT": json.dumps({"mlflow.parentRunId": parent} if parent else {}),
-        }
-        began = time.perf_counter()
-        self._ends_at = began + (limits(self._plan.budget)[1] or math.nan) * left / self._jobs
-        while self.waiting or self._running:
-            while self.waiting and len(self._running) < self._jobs:
-                run = self.waiting.popleft()
-                self._running.append((run, start(run, flags, environment)))
-            self._show(*(f"{run.name}  {last_line(run)}" for run, _ in self._running))
-            time.sleep(LOOK_S)
-            stopping.check()
-            for run, process in [each for each in self._running if each[1].poll() is not None]:
-                self._running.remove((run, process))
-                _repeat(run)
-                now, to_do = time.perf_counter(), len(self.waiting) + len(self._running)
-                self._ends_at = now + to_do * (now - began) / (left - to_do)
-                self._take_in(run, process.returncode)
-
-    def close(self) -> None:
-        """Ask what is running to save and to end, and wait until it has."""
-        if self._running:
+    waiting, running, failed = deque(left), list[tuple[RunFolder, Popen[bytes]]](), 0
+    began, ends_at = time.perf_counter(), math.nan
+    try:
+        with Display(console) as shown:
+            while (waiting or running) and not stopping.requested():
+                while waiting and len(running) < jobs:
+                    run = waiting.popleft()
+                    running.append((run, start(run)))
+                done = total - len(waiting) - len(running)
+                shown.head, shown.share = f"run {done}/{total}", done / total
+                shown.facts = f"ETA {clock(ends_at - time.perf_counter())}"
+                shown.rest = "\n".join(f"{run.name}  {last_line(run)}" for run, _ in running)
+                time.sleep(LOOK_S)
+                for run, process in [each for each in running if each[1].poll() is not None]:
+                    running.remove((run, process))
+                    _repeat(run)
+                    now, to_do = time.perf_counter(), len(waiting) + len(running)
+                    ends_at = now + to_do * (now - began) / (len(left) - to_do)
+                    if code := process.returncode:
+                        failed += 1
+                        _say_failed(run.path, f"its process ended with exit code {code}; see {short_path(log_of(run))}")
+                    else:
+                        figures = read_run(run.path).figures
+                        driven = f"success {figures['success_rate']:.0%}, {figures['distance_m']:,.0f} m"
+                        text = f"run {total - to_do}/{total}  {run.name}: {driven}, {figures['training_s']:.0f} s"
+                        console.print(text, soft_wrap=True, highlight=False)
+    finally:
+        if running:
             common.new_console(stderr=True).print("stopping; runs are being saved ...", style="dim")
-        for _, process in self._running:
+        for _, process in running:
             process.terminate()
-        for run, process in self._running:
+        for run, process in running:
             process.wait()
             _repeat(run)
-
-    def _take_in(self, planned: RunFolder, code: int = 0) -> None:
-        """Read a run whose process has ended with this exit code, and measure its errors, unless it has failed."""
-        self._show(f"{planned.name}  measuring errors")
-        try:
-            if code:
-                raise GridSimError(f"its process ended with exit code {code}; see {short_path(log_of(planned))}")
-            run = read_run(planned.path)
-            if run.settings != planned.settings:
-                what = f"{planned.path} is not what comparison.json asks for"
-                raise GridSimError(f"{what}; was it edited, or made by another version? Start a new comparison")
-            self.runs.append(measured(run))
-        except GridSimError as error:
-            self.failed += 1
-            print(f"{PROG}: {planned.name} failed: {error}", file=sys.stderr, flush=True)
-            return
-        report.write_tables(self._path, self.runs, self._plan)
-        figures = self.runs[-1].figures
-        self.console.print(
-            f"{self.display.head}  {planned.name}: success {figures['success_rate']:.0%}, "
-            f"{figures['distance_m']:,.0f} m, velocity error {figures['velocity_error_percent']:.1f} %, "
-            f"{figures['training_s']:.0f} s  {self.display.facts}",
-            soft_wrap=True, highlight=False,
-        )  # fmt: skip
-
-    def _show(self, *lines: str) -> None:
-        """Show these lines under how many runs are done, and when all will be."""
-        total, seconds = len(self.planned), self._ends_at - time.perf_counter()
-        done = total - len(self.waiting) - len(self._running)
-        self.display.head, self.display.share = f"run {done}/{total}", done / total
-        self.display.facts = f"ETA {clock(max(seconds, 0.0)) if math.isfinite(seconds) else '-:--'}"
-        self.display.rest = "\n".join(lines)
+    return failed
 
 
 def _repeat(run: RunFolder) -> None:
@@ -225,32 +194,33 @@ def _repeat(run: RunFolder) -> None:
         print(f"{run.name}: {kind}: {text}", file=sys.stderr, flush=True)
 
 
+def _say_failed(path: Path, reason: str) -> None:
+    print(f"{PROG}: {path.name} failed: {reason}", file=sys.stderr, flush=True)
+
+
 def _warn(text: str) -> None:
     print(f"{PROG}: warning: {text}", file=sys.stderr, flush=True)
 
 
-def _compare_finished(flags: CompareFlags) -> int:
-    """Compare finished runs. Raises GridSimError."""
-    default, console = CompareFlags(), common.new_console()
-    for f in dataclasses.fields(CompareFlags):
-        if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
-            raise GridSimError(f"{common.as_flag(f.name)}: finished runs are compared as they are; leave it out")
-    found, runs = read_runs(map(Path, flags.runs)), list[Run]()
-    path = new_folder(Path(flags.output), flags.name, "comparison")
+def _report(console: Console, path: Path, found: Sequence[Run], plan: Plan | None) -> int:
+    """Measure the errors of finished runs, write and print their tables; after a signal, tables without errors.
+
+    Returns: how many could not be measured.
+    """
+    runs, failed = list[Run](), 0
     with Display(console) as shown:
-        for run in found:
-            shown.head, shown.share = f"run {len(runs)}/{len(found)}", len(runs) / len(found)
+        for k, run in enumerate(found):
+            shown.head, shown.share = f"run {k}/{len(found)}", k / len(found)
             shown.rest = f"{run.folder.name}  measuring errors"
-            runs.append(measured(run))
-    path.mkdir(parents=True)
-    report.write(path, runs, None)
-    _print(console, path, runs, None)
-    return 0
-
-
-def _print(console: Console, path: Path, runs: Sequence[Run], plan: Plan | None) -> None:
-    """Print the tables without their quartiles, and where the complete ones are."""
+            try:
+                runs.append(run if stopping.requested() else measured(run))
+            except GridSimError as error:
+                failed += 1
+                _say_failed(run.folder, str(error))
+    if not runs:
+        return failed
     groups = tables.group(runs, plan)
+    report.write(path, groups, plan)
     console.print(tables.introduction(plan))
     for columns in (tables.DRIVING, tables.ERRORS):
         names, *rows = tables.table(groups, columns, spread=False)
@@ -265,6 +235,7 @@ def _print(console: Console, path: Path, runs: Sequence[Run], plan: Plan | None)
     for note in tables.notes(groups):
         console.print(f"- {note}".replace(", quartiles in brackets", ""), highlight=False)
     console.print(f"tables, picture and drives: {short_path(path / report.REPORT)}", soft_wrap=True)
+    return failed
 
 
 compare_main = partial(common.main, PROG, _compare)

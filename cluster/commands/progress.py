@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections import deque
@@ -113,7 +114,9 @@ def row_in_words(settings: RunSettings, steps: int, row: Mapping[str, float]) ->
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds, with hours if there are any."""
-    minutes, rest = divmod(round(seconds), 60)
+    """Minutes and seconds, with hours if there are any; nan is unknown."""
+    if math.isnan(seconds):
+        return "-:--"
+    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -176,18 +176,29 @@ def is_finished(run: RunFolder) -> bool:
     return (run.path / SUMMARY).is_file()
 
 
+def read_finished(folder: Path, plan: Plan) -> list[Run]:
+    """The finished runs of a comparison. Raises GridSimError if one is damaged, or is not what was planned."""
+    runs = []
+    for planned in filter(is_finished, plan.planned(folder)):
+        runs.append(read_run(planned.path))
+        if runs[-1].settings != planned.settings:
+            what = f"{planned.path} is not what {COMPARISON} asks for"
+            raise GridSimError(f"{what}; was it edited, or made by another version? Start a new comparison")
+    return runs
+
+
 def read_runs(folders: Iterable[Path]) -> list[Run]:
     """Finished runs from their folders, each once; a comparison's folder stands for its finished runs.
 
     Raises: GridSimError.
     """
-    paths: list[Path] = []
+    runs: list[Run] = []
     for folder in folders:
-        of_folder = [folder]
-        if (folder / COMPARISON).is_file():
-            of_folder = [run.path for run in read_plan(folder).planned(folder) if is_finished(run)]
-            if not of_folder:
-                again = f"continue it with --resume {as_argument(folder)}"
-                raise GridSimError(f"{folder}: none of its runs is finished; {again}")
-        paths += of_folder
-    return list({path.resolve(): read_run(path) for path in paths}.values())
+        if not (folder / COMPARISON).is_file():
+            runs.append(read_run(folder))
+        elif finished := read_finished(folder, read_plan(folder)):
+            runs += finished
+        else:
+            again = f"continue it with --resume {as_argument(folder)}"
+            raise GridSimError(f"{folder}: none of its runs is finished; {again}")
+    return list({run.folder.resolve(): run for run in runs}.values())

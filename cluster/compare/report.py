@@ -11,8 +11,7 @@ from urllib.parse import quote
 
 from cluster.compare import picture
 from cluster.compare.plan import COMPARISON, Plan, is_finished, read_plan
-from cluster.compare.results import Run
-from cluster.compare.tables import DRIVING, ERRORS, Groups, group, introduction, notes, table, table_csv, table_md
+from cluster.compare.tables import DRIVING, ERRORS, Groups, introduction, notes, table, table_csv, table_md
 from cluster.store import checkpoint
 from cluster.store.checkpoint import CONFIG, SUMMARY
 from cluster.store.folder import PAGE
@@ -28,17 +27,10 @@ td:has(a) { white-space: normal; overflow-wrap: anywhere; min-width: 12em }
 img { max-width: 100% }"""
 
 
-def write_tables(folder: Path, runs: Sequence[Run], plan: Plan | None) -> Groups:
-    """Write table.md and table.csv. Returns: what is in them."""
-    groups = group(runs, plan)
-    checkpoint.write_atomic(folder / TABLE, table_md(groups, plan), durable=False)
-    checkpoint.write_atomic(folder / ROWS, table_csv(groups, folder), durable=False)
-    return groups
-
-
-def write(folder: Path, runs: Sequence[Run], plan: Plan | None) -> None:
-    """Write tables, the picture and the page."""
-    groups = write_tables(folder, runs, plan)
+def write(folder: Path, groups: Groups, plan: Plan | None) -> None:
+    """Write the tables, the picture and the page."""
+    checkpoint.write_atomic(folder / TABLE, table_md(groups, plan))
+    checkpoint.write_atomic(folder / ROWS, table_csv(groups, folder))
     picture.comparison(groups, folder / PICTURE)
     checkpoint.write_atomic(folder / REPORT, page(folder, groups, plan, (folder / PICTURE).read_bytes()))
 

@@ -12,7 +12,7 @@ from finished_runs import run
 from PIL import Image
 from rich.console import Console
 
-from cluster.commands.compare import _print
+from cluster.commands import compare
 from cluster.compare import picture, tables
 from cluster.compare.plan import Plan
 from cluster.compare.report import page
@@ -62,9 +62,10 @@ def test_runs_of_different_traffic_and_views_are_not_mixed():
 
 
 @pytest.mark.parametrize("plan", [None, PLAN])
-def test_the_terminal_shows_the_tables(tmp_path, plan):
+def test_the_terminal_shows_the_tables(tmp_path, monkeypatch, plan):
+    monkeypatch.setattr(compare, "measured", lambda run: run)
     shown = io.StringIO()
-    _print(Console(width=80, file=shown), tmp_path, RUNS, plan)
+    assert compare._report(Console(width=80, file=shown), tmp_path, RUNS, plan) == 0
     text = shown.getvalue()
     assert max(map(len, text.splitlines()[:-1])) <= 80
     for word in ("evolution", "90", "15.0", "Fewer than 3 seeds are too few for a verdict."):
