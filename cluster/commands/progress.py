@@ -60,7 +60,7 @@ class RunDisplay(Display):
 
     def row(self, steps: int, row: Mapping[str, float]) -> None:
         """Show a step that is done: the number of steps, and the row of the history."""
-        self.share, self.head = _progress(self._settings, steps, row)
+        self.share, self.head = progress(self._settings, steps, row)
         self.facts = f"success {row['validation/success_rate']:.0%}"
         if self.share < 1.0:
             self.facts += f"  ETA {self._eta()}"
@@ -83,7 +83,7 @@ class RunDisplay(Display):
         return f"{clock((1.0 - self.share) / (self.share - before) * (now - begun))} at most"
 
 
-def _progress(settings: RunSettings, steps: int, row: Mapping[str, float]) -> tuple[float, str]:
+def progress(settings: RunSettings, steps: int, row: Mapping[str, float]) -> tuple[float, str]:
     """How far a run is, by the limit that it reaches first: the share (0 without a limit), and what is done, in words.
 
     Args: the number of its steps, and the latest one's row of the history.
@@ -106,7 +106,7 @@ def row_in_words(settings: RunSettings, steps: int, row: Mapping[str, float]) ->
             f"distance {row['distance_m/best']:,.0f} m, {row['network/success_rate']:.0%} succeed  "
             f"{row['speed_mps/best']:.1f} m/s  loss {row['loss']:.3f}  {row['updates'] / 1e3:.0f} k updates"
         )
-    done = "" if _progress(settings, steps, row)[1].endswith("generations") else f"{count(steps, 'generation')}  "
+    done = "" if progress(settings, steps, row)[1].endswith("generations") else f"{count(steps, 'generation')}  "
     return (
         f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
         f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"

@@ -65,25 +65,23 @@ def made(tmp_path, monkeypatch, capsys):
     script.chmod(0o755)
     for planned in PLAN.planned(tmp_path / "made"):
         make_run(planned.path, settings=planned.settings)
-    monkeypatch.setattr(compare, "measured", with_errors)
     tracking: Any = Mock(uri="http://u:hunter2@h:5000", error="no answer", run_id="", close=lambda status: None)
     tracking.wait_id.return_value = "17"
+    monkeypatch.setattr(compare, "measured", with_errors)
     monkeypatch.setattr(compare, "check_uri", lambda *_: tracking.uri)
     monkeypatch.setattr(compare, "Tracking", lambda *_: tracking)
     return SimpleNamespace(run=partial(call, compare_main, monkeypatch, capsys), tracking=tracking)
 
 
-def asked(tmp_path):
-    return [line.split()[0] for line in (tmp_path / "asked").read_text().splitlines()]
-
-
 def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(tmp_path, made):
+    def asked():
+        return [line.split()[0] for line in (tmp_path / "asked").read_text().splitlines()]
+
     names = [planned.name for planned in PLAN.planned(tmp_path)]
-    for failing in (f"broken-{names[2]}", f"killed-{names[3]}"):
-        (tmp_path / failing).touch()
+    for kind, name in zip(("away", "broken", "killed"), names[1:4], strict=True):
+        (tmp_path / f"{kind}-{name}").touch()
     code, out, err = made.run(*ASKED, "--name", "c", "--seeds", 1)
-    assert code == 1
-    assert asked(tmp_path) == names[:4]
+    assert (code, asked()) == (1, names[:4])
     assert f"run 2/4  {names[1]}: success 50%, 90 m, 6 s\n" in out
     for line in (
         f"{names[0]}: warning: MLflow is slow",
@@ -93,20 +91,21 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(
     ):
         assert line in err.splitlines()
     assert err.splitlines()[-1].endswith("--resume runs/c")
-    for failing in (f"broken-{names[2]}", f"killed-{names[3]}"):
-        (tmp_path / failing).unlink()
+    for kind, name in zip(("away", "broken", "killed"), names[1:4], strict=True):
+        (tmp_path / f"{kind}-{name}").unlink()
     config = tmp_path / "runs/c" / names[0] / "config.json"
     whole = config.read_text()
     config.write_text(whole.replace('"sigma": 0.5', '"sigma": 0.25'))
-    code, out, err = made.run("--resume", "runs/c", "--seeds", 2, "--jobs", 3)
-    assert (code, out) == (2, "")
+    code, _, err = made.run("--resume", "runs/c")
+    assert code == 2
     assert f"{config.parent} is not what comparison.json asks for" in err
     config.write_text(whole)
-    code, out, err = made.run("--resume", "runs/c", "--seeds", 2, "--jobs", 3)
-    assert (code, sorted(asked(tmp_path)[4:])) == (0, sorted(names[2:]))
+    code, out, _ = made.run("--resume", "runs/c", "--seeds", 2, "--jobs", 3)
+    assert code == 0
     assert "comparing 8 runs, 2 of them finished" in out
+    assert sorted(asked()[4:]) == sorted(names[1:]), "one of the finished ones to send what MLflow lacks of it"
     assert made.run("--resume", "runs/c")[0] == 0
-    assert len(asked(tmp_path)) == 10
+    assert len(asked()) == 4 + 7
     assert {"comparison.html", "table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
     assert made.run("runs/c", f"runs/c/{names[0]}", "--name", "again")[0] == 0
@@ -127,16 +126,6 @@ def test_a_run_gets_the_password_and_the_parent_of_its_mlflow_run_in_its_environ
     made.tracking.wait_id.return_value = ""
     made.run(*budget, "--name", "d")
     assert (tmp_path / "asked").read_text().endswith(" {}\n"), "its runs do not probe MLflow again"
-
-
-def test_what_mlflow_lacks_of_a_finished_run_is_sent_as_the_comparison_is_resumed(tmp_path, made):
-    names = [planned.name for planned in PLAN.planned(tmp_path)][:4]
-    (tmp_path / f"away-{names[1]}").touch()
-    assert made.run(*ASKED, "--name", "c", "--seeds", 1)[0] == 0
-    (tmp_path / f"away-{names[1]}").unlink()
-    for _ in range(2):
-        assert made.run("--resume", "runs/c")[0] == 0
-        assert asked(tmp_path) == [*names, names[1]]
 
 
 def processes_of(process):
