@@ -77,13 +77,7 @@ def _compare() -> int:
     arguments, console = sys.argv[1:], common.new_console()
     flags = common.parse(CompareFlags, PROG, arguments, QUICK if "--quick" in arguments else None)
     if flags.runs:
-        for f in dataclasses.fields(flags):
-            if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(CompareFlags(), f.name):
-                raise GridSimError(f"{common.as_flag(f.name)}: finished runs are compared as they are; leave it out")
-        runs = read_runs(map(Path, flags.runs))
-        path = new_folder(Path(flags.output), flags.name, "comparison")
-        path.mkdir(parents=True)
-        return common.FAILED if _report(console, path, runs, None) else 0
+        return _compare_finished(console, flags)
     check_workers(flags.workers, flags.patience)
     if not 1 <= flags.jobs <= MAX_JOBS:
         raise GridSimError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
@@ -102,7 +96,8 @@ def _compare() -> int:
     address = cluster_address(flags.address) if left else None
     lock(path)
     if flags.jobs > 1 and wall_s:
-        _warn("runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps")
+        text = "runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps"
+        _say(f"{PROG}: warning: {text}")
     common.warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
     shared = {
         "workers": flags.workers, "address": address or "local", "patience": flags.patience,
@@ -134,14 +129,24 @@ def _compare() -> int:
         tracking.close("FAILED")
         fail(PROG, str(error), f"continue with: {again}", common.FAILED)
     if unsent := tracking.close(status):
-        _warn(f"{unsent}; send it later with: {again}")
+        _say(f"{PROG}: warning: {unsent}; send it later with: {again}")
     console.print(f"compare: {tracking.where(command_path('mlflow'))}", soft_wrap=True)
     if status == "KILLED":
-        print(f"{PROG}: stopped; continue with: {again}", file=sys.stderr)
+        _say(f"{PROG}: stopped; continue with: {again}")
         return stopping.INTERRUPTED
     if failed:
         fail(PROG, f"{failed} of {total} runs failed", f"continue with: {again}", common.FAILED)
     return 0
+
+
+def _compare_finished(console: Console, flags: CompareFlags) -> int:
+    for f in dataclasses.fields(flags):
+        if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(CompareFlags(), f.name):
+            raise GridSimError(f"{common.as_flag(f.name)}: finished runs are compared as they are; leave it out")
+    runs = read_runs(map(Path, flags.runs))
+    path = new_folder(Path(flags.output), flags.name, "comparison")
+    path.mkdir(parents=True)
+    return common.FAILED if _report(console, path, runs, None) else 0
 
 
 def _train(
@@ -171,7 +176,8 @@ def _train(
                     ends_at = now + to_do * (now - began) / (len(left) - to_do)
                     if code := process.returncode:
                         failed += 1
-                        _say_failed(run.path, f"its process ended with exit code {code}; see {short_path(log_of(run))}")
+                        see = f"its process ended with exit code {code}; see {short_path(log_of(run))}"
+                        _say(f"{PROG}: {run.name} failed: {see}")
                     else:
                         figures = read_run(run.path).figures
                         driven = f"success {figures['success_rate']:.0%}, {figures['distance_m']:,.0f} m"
@@ -191,15 +197,11 @@ def _train(
 def _repeat(run: RunFolder) -> None:
     """Print what a run's process has warned of, and why it failed."""
     for kind, text in said(run):
-        print(f"{run.name}: {kind}: {text}", file=sys.stderr, flush=True)
+        _say(f"{run.name}: {kind}: {text}")
 
 
-def _say_failed(path: Path, reason: str) -> None:
-    print(f"{PROG}: {path.name} failed: {reason}", file=sys.stderr, flush=True)
-
-
-def _warn(text: str) -> None:
-    print(f"{PROG}: warning: {text}", file=sys.stderr, flush=True)
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _report(console: Console, path: Path, found: Sequence[Run], plan: Plan | None) -> int:
@@ -216,7 +218,7 @@ def _report(console: Console, path: Path, found: Sequence[Run], plan: Plan | Non
                 runs.append(run if stopping.requested() else measured(run))
             except GridSimError as error:
                 failed += 1
-                _say_failed(run.folder, str(error))
+                _say(f"{PROG}: {run.folder.name} failed: {error}")
     if not runs:
         return failed
     groups = tables.group(runs, plan)
