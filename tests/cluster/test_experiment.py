@@ -96,38 +96,32 @@ def test_budgets_and_limits_are_those_of_each_run():
         assert (settings["car_steps"], settings["evaluate_every"]) == (limits(budget)[0], every)
 
 
-@pytest.mark.parametrize(
-    "plan",
-    [
+def test_the_flags_of_a_run_give_its_settings():
+    for plan in (
         Plan(budget="90s"),
         Plan(budget="200k", traffic=3, population=64, generations=5, seeds=2),
         Plan(observation="grid", learners=("evolution", "dqn"), grid=("policy=cnn:8,16,32@1,cnn:8,16,32@2",)),
         Plan(("city",), ("evolution",), grid=("policy=mlp:64+steering",)),  # a default, but not in traffic
         Plan(("curved",), ("two-parents",), grid=("mutation-rate=0.03,0.5", "elites=0,8")),
-    ],
-)
-def test_the_flags_of_a_run_give_its_settings(plan):
-    plan.check()
-    for run in plan.planned(Path("runs/c")):
-        kind: Any = EvolveFlags if run.settings.command == "gridsim-evolve" else DqnFlags
-        flags = parse(kind, run.settings.command, flags_of(run, wall_time=9.5))
-        assert select(type(run.settings), flags) == run.settings
-        assert (flags.output, flags.name, flags.wall_time) == ("runs/c", run.name, 9.5)
+    ):
+        plan.check()
+        for run in plan.planned(Path("runs/c")):
+            kind: Any = EvolveFlags if run.settings.command == "gridsim-evolve" else DqnFlags
+            flags = parse(kind, run.settings.command, flags_of(run, wall_time=9.5))
+            assert select(type(run.settings), flags) == run.settings
+            assert (flags.output, flags.name, flags.wall_time) == ("runs/c", run.name, 9.5)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"plan": None}, "", "[]", "\0", {"seeds": "3"}, {"seeds": 10**9}, {"scenarios": [["curved"]]},
-        {"scenarios": ["../../etc"]}, {"budget": 5}, {"observation": "camera"}, {"traffic": 1e9}, {"extra": 1},
-    ],
-)  # fmt: skip
-def test_edited_comparison_is_refused(tmp_path, change):
+def test_edited_comparison_is_refused(tmp_path):
     write_plan(tmp_path, PLAN)
     path = tmp_path / "comparison.json"
-    content = json.loads(path.read_text())
-    if isinstance(change, dict) and "plan" not in change:
-        change = {"plan": content["plan"] | change}
-    path.write_text(change if isinstance(change, str) else json.dumps(content | change))
-    with pytest.raises(GridSimError, match=r"^.*comparison\.json.*$"):
-        read_plan(tmp_path)
+    whole = json.loads(path.read_text())
+    changes: list[dict[str, Any]] = [
+        {"seeds": "3"}, {"seeds": 10**9}, {"scenarios": [["curved"]]}, {"scenarios": ["../../etc"]}, {"budget": 5},
+        {"observation": "camera"}, {"traffic": 1e9}, {"extra": 1},
+    ]  # fmt: skip
+    edited = [json.dumps({"plan": whole["plan"] | change}) for change in changes]
+    for text in ("", "[]", "\0", '{"plan": null}', *edited):
+        path.write_text(text)
+        with pytest.raises(GridSimError, match=r"^.*comparison\.json.*$"):
+            read_plan(tmp_path)
