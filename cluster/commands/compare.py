@@ -25,7 +25,7 @@ from cluster.commands import common
 from cluster.commands.common import WorkFlags, command_path, fail, short_path
 from cluster.commands.progress import Display, clock
 from cluster.compare import report, tables
-from cluster.compare.plan import MAX_WALL_S, Plan, is_finished, limits, read_finished, read_plan, read_runs, write_plan
+from cluster.compare.plan import MAX_WALL_S, Plan, has_summary, limits, read_finished, read_plan, read_runs, write_plan
 from cluster.compare.processes import is_sent, last_line, log_of, said, start
 from cluster.compare.results import Run, measured, read_run
 from cluster.redaction import redacted
@@ -91,7 +91,7 @@ def _compare() -> int:
     plan = common.select(Plan, flags)
     plan.check()
     total, done = len(plan.planned(path)), len(read_finished(path, plan))
-    left = [run for run in plan.planned(path) if not (is_finished(run) and is_sent(run))]
+    left = [run for run in plan.planned(path) if not (has_summary(run) and is_sent(run))]
     uri, wall_s = check_uri(flags.tracking_uri, saved_uri(path)), limits(plan.budget)[1]
     address = cluster_address(flags.address) if left else None
     lock(path)
@@ -120,7 +120,8 @@ def _compare() -> int:
                 "MLFLOW_TRACKING_URI": tracking.uri,  # with its password, which no flag may hold
                 "MLFLOW_RUN_CONTEXT": json.dumps({"mlflow.parentRunId": parent} if parent else {}),
             }
-            failed = _train(console, left, total, flags.jobs, partial(start, flags=shared, environment=environment))
+            start_run = partial(start, flags=shared, environment=environment)
+            failed = _train(console, left, total, flags.jobs, wall_s or math.nan, start_run)
         failed += _report(console, path, read_finished(path, plan), plan)
         stopping.check()
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
@@ -150,14 +151,16 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
 
 
 def _train(
-    console: Console, left: Sequence[RunFolder], total: int, jobs: int, start: Callable[[RunFolder], Popen[bytes]]
-) -> int:
+    console: Console, left: Sequence[RunFolder], total: int, jobs: int, run_s: float,
+    start: Callable[[RunFolder], Popen[bytes]],
+) -> int:  # fmt: skip
     """Train the runs that are left of all, so many at once, until a signal comes; a run that fails stops no other.
 
-    Returns: how many failed.
+    Args: `run_s` is how long a run may take, nan if that is unknown. Returns: how many failed.
     """
     waiting, running, failed = deque(left), list[tuple[RunFolder, Popen[bytes]]](), 0
-    began, ends_at = time.perf_counter(), math.nan
+    began = time.perf_counter()
+    ends_at = began + run_s * len(left) / jobs
     try:
         with Display(console) as shown:
             while (waiting or running) and not stopping.requested():
@@ -180,9 +183,12 @@ def _train(
                         _say(f"{PROG}: {run.name} failed: {see}")
                     else:
                         figures = read_run(run.path).figures
-                        driven = f"success {figures['success_rate']:.0%}, {figures['distance_m']:,.0f} m"
-                        text = f"run {total - to_do}/{total}  {run.name}: {driven}, {figures['training_s']:.0f} s"
-                        console.print(text, soft_wrap=True, highlight=False)
+                        console.print(
+                            f"run {total - to_do}/{total}  {run.name}: success {figures['success_rate']:.0%}, "
+                            f"{figures['distance_m']:,.0f} m, {figures['training_s']:.0f} s  "
+                            f"ETA {clock(ends_at - now)}",
+                            soft_wrap=True, highlight=False,
+                        )  # fmt: skip
     finally:
         if running:
             common.new_console(stderr=True).print("stopping; runs are being saved ...", style="dim")

@@ -171,7 +171,7 @@ def read_plan(folder: Path) -> Plan:
         raise GridSimError(f"{path}: damaged, or of another version of GridSim; start a new comparison") from error
 
 
-def is_finished(run: RunFolder) -> bool:
+def has_summary(run: RunFolder) -> bool:
     """Whether there is a summary, the last file that a run writes."""
     return (run.path / SUMMARY).is_file()
 
@@ -179,7 +179,7 @@ def is_finished(run: RunFolder) -> bool:
 def read_finished(folder: Path, plan: Plan) -> list[Run]:
     """The finished runs of a comparison. Raises GridSimError if one is damaged, or is not what was planned."""
     runs = []
-    for planned in filter(is_finished, plan.planned(folder)):
+    for planned in filter(has_summary, plan.planned(folder)):
         runs.append(read_run(planned.path))
         if runs[-1].settings != planned.settings:
             what = f"{planned.path} is not what {COMPARISON} asks for"

@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from cluster.compare import picture
-from cluster.compare.plan import COMPARISON, Plan, is_finished, read_plan
+from cluster.compare.plan import COMPARISON, Plan, has_summary, read_plan
 from cluster.compare.tables import DRIVING, ERRORS, Groups, introduction, notes, table, table_csv, table_md
 from cluster.store import checkpoint
 from cluster.store.checkpoint import CONFIG, SUMMARY
@@ -78,7 +78,7 @@ def read_comparison(folder: Path) -> Content:
     """What MLflow gets of a comparison, from its folder: the plan, the files, and how many runs were done by when."""
     plan = read_plan(folder)
     planned = plan.planned(folder)
-    done = [run.path for run in planned if is_finished(run)]
+    done = [run.path for run in planned if has_summary(run)]
     started = min(((path / CONFIG).stat().st_mtime for path in done), default=0.0)
     times = sorted((path / SUMMARY).stat().st_mtime - started for path in done)
     files = [folder / name for name in (COMPARISON, REPORT, TABLE, ROWS, PICTURE)]
