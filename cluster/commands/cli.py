@@ -34,7 +34,7 @@ from cluster.commands.common import (
     warn_of_many_workers,
 )
 from cluster.commands.entry import STARTED
-from cluster.commands.progress import Progress
+from cluster.commands.progress import RunDisplay
 from cluster.commands.tables import errors_table, held_out_table
 from cluster.compare.results import series
 from cluster.run import Place, Session, train
@@ -233,7 +233,7 @@ def _learn(kind: type[Flags]) -> int:
     code, message = 0, ""
     try:
         initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
-        with Progress(console, settings) as shown:
+        with RunDisplay(console, settings) as shown:
             session = train(run, place, shown.event, shown.row, initial=initial, started=STARTED)
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         code = INTERRUPTED

@@ -25,27 +25,21 @@ def comparison(groups: Groups, path: Path) -> None:
     width = 0.8 / len(learners)
     figure, axes = figure_of(max(12.0, 4.0 + 3.0 * len(roads)), 4.6, 3)
     bars = {}
-    for axis, (name, scale, title) in zip(axes, PANELS, strict=True):
-        for (road, learner), rows in groups.items():
+    for axis, (figure_name, scale, title) in zip(axes, PANELS, strict=True):
+        for (road, learner), runs in groups.items():
             k = learners.index(learner)
             place = roads.index(road) + (k - (len(learners) - 1) / 2) * width
-            values, found = quartiles(rows, name)
-            if not values:
-                axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
-                continue
+            values, found = quartiles(runs, figure_name)
             lower, median, upper = (scale * value for value in found)
             bars[learner] = axis.bar(
-                place, median, 0.92 * width, color=COLOURS.get(learner, f"C{k % 10}"), alpha=0.75, capsize=3, zorder=2,
-                yerr=[[median - lower], [upper - median]] if len(values) > 1 else None,
-                error_kw={"ecolor": "#212529", "elinewidth": 1.1},
+                place, median, 0.92 * width, color=COLOURS.get(learner, f"C{k % 10}"), alpha=0.75, zorder=2,
+                yerr=[[median - lower], [upper - median]], capsize=3, error_kw={"ecolor": "#212529", "elinewidth": 1.1},
             )  # fmt: skip
-            beside = place + width * np.linspace(-0.22, 0.22, len(values)) if len(values) > 1 else [place]
-            axis.plot(beside, scale * np.array(values), linestyle="", marker="o", markersize=3.5, color="white",
+            beside = (np.arange(len(values)) - (len(values) - 1) / 2) / max(len(values), 1)  # side by side
+            axis.plot(place + 0.5 * width * beside, scale * np.array(values), "o", markersize=3.5, color="white",
                       markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
-        axis.set_title(title)
+        axis.set(title=title, xlim=(-0.5, len(roads) - 0.5), ylim=(0.0, None))
         axis.set_xticks(range(len(roads)), map(drawable, roads))
-        axis.set_xlim(-0.5, len(roads) - 0.5)
-        axis.set_ylim(bottom=0.0)
         axis.grid(axis="y", alpha=0.25, zorder=0)
         axis.spines[["top", "right"]].set_visible(False)
     figure.legend(

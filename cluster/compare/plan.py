@@ -11,9 +11,8 @@ import itertools
 import json
 import os
 import re
-import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,16 +21,16 @@ from cluster.compare.results import LEARNERS, Learner, Run, read_run
 from cluster.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.store import checkpoint
 from cluster.store.checkpoint import SUMMARY
+from cluster.store.folder import RunFolder
 from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file, label
 
 COMPARISON = "comparison.json"
-FORMAT = 3
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
 UNLIMITED = MAX_STEPS  # generations or car-steps of a run that its wall time ends
-CAR_STEPS = {None: 1, "k": 10**3, "M": 10**6, "G": 10**9}  # in units of a budget
+CAR_STEPS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}  # in units of a budget
 SECONDS = {"s": 1, "min": 60, "h": 3600}
 EVALUATIONS = 10  # of the DQN, at least
 # Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
@@ -39,30 +38,6 @@ PLANNED = (
     "scenario", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
     "evaluate_every",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """A training run of a comparison: its folder, which may not be there yet, and what it is asked to do."""
-
-    path: Path
-    settings: RunSettings
-
-    @property
-    def name(self) -> str:
-        return self.path.name
-
-    def finished(self) -> bool:
-        """Whether there is a summary, the last file that a run writes."""
-        return (self.path / SUMMARY).is_file()
-
-    def flags(self) -> list[str]:
-        """Flags with which the learner's command makes this run: the road, the seed, and what is not the default."""
-        own, always = vars(self.settings), ("scenario", "traffic", "seed", "observation")
-        usual = vars(type(self.settings)(own["scenario"], own["traffic"], observation=own["observation"]))
-        chosen = {name: value for name, value in own.items() if name in always or value != usual[name]}
-        chosen |= {"output": self.path.parent, "name": self.name}
-        return [f"--{name.replace('_', '-')}={value}" for name, value in chosen.items()]
 
 
 @dataclass(frozen=True)
@@ -96,50 +71,42 @@ class Plan:
 
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
-        for flag, given in (("scenarios", self.scenarios), ("learners", self.learners)):
-            if not given or len(set(given)) != len(given):
-                raise GridSimError(f"--{flag} {' '.join(given)}: name at least one, and each once")
-        if not set(self.learners) <= set(LEARNERS):
-            raise GridSimError(f"--learners: use {', '.join(LEARNERS)}")
-        for flag, number, least, most in (
-            ("seeds", self.seeds, 1, MAX_SEEDS),
-            ("population", self.population, 0, MAX_STEPS),
-            ("generations", self.generations, 0, MAX_STEPS),
-        ):
-            if not least <= number <= most:
-                raise GridSimError(f"--{flag} must be {least} to {most:,}, not {number}")
+        if not self.scenarios or not self.learners:
+            raise GridSimError("--scenarios, --learners: name at least one of each")
+        if not 1 <= self.seeds <= MAX_SEEDS:
+            raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         runs = dataclasses.replace(self, seeds=1).planned(Path())
         if len({run.name for run in runs}) != len(runs):
-            raise GridSimError("two runs would have the same name: rename a map, or name a value of --grid once")
-        for run in runs:
-            run.settings.check()
+            raise GridSimError("two runs would have the same name: name all once, also in --grid, or rename a map")
+        # The DQN's settings hold neither --population nor --generations.
+        for settings in (self.settings(self.scenarios[0], "evolution", 0), *(run.settings for run in runs)):
+            settings.check()
 
-    def planned(self, folder: Path) -> list[PlannedRun]:
-        """All runs of a comparison in that folder, in the order in which they are made."""
+    def planned(self, folder: Path) -> list[RunFolder]:
+        """All runs of a comparison in that folder, in the order in which they are made; they may not be there yet."""
         found = []
         for seed, scenario, learner in itertools.product(range(self.seeds), self.scenarios, self.learners):
             for variant in self.variants(learner):
                 words = [label(scenario), learner, *(f"{name}={value}" for name, value in variant.items()), f"s{seed}"]
                 settings = self.settings(scenario, learner, seed, **variant)
-                found.append(PlannedRun(folder / file_name("-".join(words)), settings))
+                found.append(RunFolder(folder / file_name("-".join(words)), settings))
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
         """The combinations of `grid` for a learner, by the settings' names. Raises GridSimError."""
-        plain = self.settings(self.scenarios[0], learner, 0)
+        usual = vars(self.settings(self.scenarios[0], learner, 0))
         choices: list[list[tuple[str, Any]]] = []
         for text in self.grid:
             flag, _, values = text.partition("=")
             name = flag.replace("-", "_")
-            planned = name in PLANNED or (name == "population" and self.population)
-            if planned or name not in vars(plain):
-                what = "the comparison sets it" if planned else f"{learner} has no such setting"
+            if name in PLANNED or name not in usual:
+                what = f"{learner} has no such setting, or the comparison sets it"
                 raise GridSimError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
-            kind = type(getattr(plain, name))
-            try:  # a word, such as mlp:6,7, may have commas, and begins with a letter
-                words = re.split(",(?=[a-z])" if kind is str else ",", values)
+            kind = type(usual[name])
+            words = re.split(",(?=[a-z])" if kind is str else ",", values)  # mlp:6,7 is one word
+            try:
                 choices.append([(name, kind(float(word)) if kind is int else kind(word)) for word in words])
-            except ValueError:
+            except (ValueError, OverflowError):
                 raise GridSimError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
         return [dict(chosen) for chosen in itertools.product(*choices)]
 
@@ -171,61 +138,53 @@ def limits(budget: str) -> tuple[int, float]:
 
     Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises GridSimError.
     """
-    match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?)\s*(k|M|G|s|min|h)?", re.sub(r"(?<=\d)[,_](?=\d)", "", budget))
-    amount = float(match[1]) if match else 0.0
-    if match and match[2] in SECONDS:
-        if 1.0 <= (seconds := round(amount * SECONDS[match[2]], 3)) <= MAX_WALL_S:
+    if match := re.fullmatch(r"(\d+(?:\.\d+)?) ?([a-zA-Z]*)", re.sub(r"(?<=\d)[,_](?=\d)", "", budget)):
+        amount, unit = float(match[1]), match[2]
+        if 1.0 <= (seconds := amount * SECONDS.get(unit, 0)) <= MAX_WALL_S:
             return 0, seconds
-    elif match and 1 <= (steps := round(amount * CAR_STEPS[match[2]])) <= MAX_CAR_STEPS:
-        return steps, 0.0
+        if 1 <= (steps := amount * CAR_STEPS.get(unit, 0)) <= MAX_CAR_STEPS:
+            return round(steps), 0.0
     usage = "give car-steps, as in 20M or 500k, or wall time from 1 s to 30 days, as in 60s, 5min or 1h"
-    raise GridSimError(f"--budget {budget[:40]}: {usage}")
+    raise GridSimError(f"--budget {budget:.40}: {usage}")
 
 
-@dataclass
-class ComparisonFolder:
-    """Where a comparison is kept, its plan, and when it began (s since the epoch)."""
-
-    path: Path
-    plan: Plan
-    started: float = field(default_factory=time.time)
-
-    def write(self) -> None:
-        """Write comparison.json. Raises CheckpointError."""
-        content = {
-            "format": FORMAT,
-            "command": "gridsim-compare",
-            "gridsim": version("gridsim"),
-            "started": self.started,
-            "plan": dataclasses.asdict(self.plan),
-        }
-        checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
-
-    def planned(self) -> list[PlannedRun]:
-        """All runs, in the order in which they are made."""
-        return self.plan.planned(self.path)
+def write_plan(folder: Path, plan: Plan) -> None:
+    """Write comparison.json. Raises CheckpointError."""
+    content = {"command": "gridsim-compare", "gridsim": version("gridsim"), "plan": dataclasses.asdict(plan)}
+    checkpoint.write_atomic(folder / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def open_comparison(folder: Path) -> ComparisonFolder:
-    """A comparison's folder, to be resumed or read. Raises GridSimError."""
+def read_plan(folder: Path) -> Plan:
+    """The plan of a comparison's folder. Raises GridSimError."""
     path = folder / COMPARISON
     if not path.is_file():
-        reason = f"it has no {COMPARISON}" if folder.is_dir() else "no such folder"
-        raise GridSimError(f"{folder} is not a comparison's folder: {reason}")
+        raise GridSimError(f"{folder} is not a comparison's folder: there is no {COMPARISON}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != FORMAT:
-            raise GridSimError(f"not a {COMPARISON} of this version of GridSim; start a new comparison")
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in content["plan"].items()
-        }
-        found = ComparisonFolder(folder.resolve(), Plan(**values), float(content["started"]))
-        found.plan.check()
-        return found
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in content["plan"].items()}
+        plan = Plan(**values)
+        plan.check()
+        return plan
     except GridSimError as error:
         raise GridSimError(f"{path}: {error}") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise GridSimError(f"{path}: damaged ({type(error).__name__}); start a new comparison") from error
+        raise GridSimError(f"{path}: damaged, or of another version of GridSim; start a new comparison") from error
+
+
+def has_summary(run: RunFolder) -> bool:
+    """Whether there is a summary, the last file that a run writes."""
+    return (run.path / SUMMARY).is_file()
+
+
+def read_finished(folder: Path, plan: Plan) -> list[Run]:
+    """The finished runs of a comparison. Raises GridSimError if one is damaged, or is not what was planned."""
+    runs = []
+    for planned in filter(has_summary, plan.planned(folder)):
+        runs.append(read_run(planned.path))
+        if runs[-1].settings != planned.settings:
+            what = f"{planned.path} is not what {COMPARISON} asks for"
+            raise GridSimError(f"{what}; was it edited, or made by another version? Start a new comparison")
+    return runs
 
 
 def read_runs(folders: Iterable[Path]) -> list[Run]:
@@ -233,14 +192,13 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
 
     Raises: GridSimError.
     """
-    found: dict[Path, Run] = {}
+    runs: list[Run] = []
     for folder in folders:
-        paths = [folder]
-        if (folder / COMPARISON).is_file():
-            paths = [run.path for run in open_comparison(folder).planned() if run.finished()]
-            if not paths:
-                again = f"continue it with --resume {as_argument(folder)}"
-                raise GridSimError(f"{folder}: none of its runs is finished; {again}")
-        for path in paths:
-            found.setdefault(path.resolve(), read_run(path))
-    return list(found.values())
+        if not (folder / COMPARISON).is_file():
+            runs.append(read_run(folder))
+        elif finished := read_finished(folder, read_plan(folder)):
+            runs += finished
+        else:
+            again = f"continue it with --resume {as_argument(folder)}"
+            raise GridSimError(f"{folder}: none of its runs is finished; {again}")
+    return list({run.folder.resolve(): run for run in runs}.values())

@@ -58,26 +58,27 @@ class Run:
 
 def read_run(folder: Path) -> Run:
     """A finished run from its folder. Raises GridSimError."""
-    path = folder / SUMMARY
+    path, again = folder / SUMMARY, f"--resume {as_argument(folder)}"
     if not (folder / CONFIG).is_file():
-        reason = f"it has no {CONFIG}" if folder.is_dir() else "no such folder"
-        raise GridSimError(f"{folder} is not a run's folder: {reason}")
+        raise GridSimError(f"{folder} is not a run's folder: there is no {CONFIG}")
     if not path.is_file():
-        again = f"finish it with --resume {as_argument(folder)}"
-        raise GridSimError(f"{folder} is not finished: it has no {SUMMARY}; {again}")
+        raise GridSimError(f"{folder} is not finished: there is no {SUMMARY}; finish it with {again}")
     settings, _ = read_config(folder / CONFIG)
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
         figures = {name: float((summary | summary["held_out"])[name]) for name in RUN_FIGURES}
         return Run(folder, settings, str(summary["champion_sha256"]), figures)
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        reason = f"{path} is damaged, or of an earlier version ({type(error).__name__})"
-        raise GridSimError(f"{reason}; delete it, and make it again with --resume {as_argument(folder)}") from error
+        raise GridSimError(f"{path} is damaged; delete it, and make it again with {again}") from error
 
 
 def measured(run: Run) -> Run:
-    """A run with its errors. Raises GridSimError."""
-    return dataclasses.replace(run, figures={**run.figures, **errors_of(run)})
+    """A run with its ERROR_FIGURES, nan if its champion never drives a metre forward. Raises GridSimError."""
+    road, traffic = run.settings.scenario, run.settings.traffic
+    found = series(load_champion(run.folder / CHAMPION), road, HELD_OUT_EPISODES, HELD_OUT_SEED, traffic)
+    figures = errors(found, VehicleConfig()) if found else {}
+    missed = {name: figures.get(original, math.nan) for name, original in ERROR_FIGURES.items()}
+    return dataclasses.replace(run, figures={**run.figures, **missed})
 
 
 def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: int) -> list[Series]:
@@ -97,11 +98,3 @@ def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic:
         with contextlib.suppress(ValueError):  # not a metre forward
             found.append(error_series(poses_of(states), road, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]
-
-
-def errors_of(run: Run) -> dict[str, float]:
-    """ERROR_FIGURES of a run's champion, nan if it never drives a metre forward. Raises GridSimError."""
-    settings, champion = run.settings, load_champion(run.folder / CHAMPION)
-    found = series(champion, settings.scenario, HELD_OUT_EPISODES, HELD_OUT_SEED, settings.traffic)
-    figures = errors(found, VehicleConfig()) if found else {}
-    return {name: figures.get(original, math.nan) for name, original in ERROR_FIGURES.items()}

@@ -5,27 +5,20 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from cluster.compare.plan import Plan
 from cluster.compare.results import ERROR_FIGURES, RUN_FIGURES, Run
-from cluster.settings import RunSettings
 from cluster.text import count
-from gridsim.maps.scenarios import REGISTRY, label
+from gridsim.maps.scenarios import label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
-COLUMNS = (
-    "scenario", "traffic", "observation", "learner", "variant", "seed",
-    *RUN_FIGURES, *ERROR_FIGURES, "champion_sha256", "run",
-)  # fmt: skip
-"""Columns of table.csv."""
 LIMITS = ("seed", "until", "generations", "car_steps", "episodes")  # settings in which variants do not differ
-Row = dict[str, Any]
-Groups = dict[tuple[str, str], list[Row]]
+Groups = dict[tuple[str, str], list[Run]]
 Columns = Mapping[str, tuple[str, float, int]]  # of each column: the figure, its unit's scale, decimal places
 DRIVING: Columns = {
     "success, %": ("success_rate", 100.0, 0),
@@ -48,45 +41,35 @@ FEW = 3  # seeds; fewer are too few for a verdict
 
 
 def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
-    """A row of COLUMNS for each run, by the names of its road and learner; with a plan, also the missing ones.
+    """Runs by the names of their road and learner; with a plan, also its missing runs, which have no figures.
 
     A road's name has the traffic if there are several amounts of it, a learner's the observation if there are both, and
     the settings in which others of this learner on this road differ.
     """
-    made = {run.settings: run for run in runs}
-    pairs: list[tuple[RunSettings, Run | None]] = [(run.settings, run) for run in runs]
     if plan:
-        pairs = [(planned.settings, made.get(planned.settings)) for planned in plan.planned(Path())]
-    traffics: dict[str, set[int]] = {}
-    values: dict[tuple[object, ...], dict[str, set[object]]] = {}  # of each setting, for a learner on a road
-    for s, _ in pairs:
-        traffics.setdefault(s.scenario, set()).add(s.traffic)
-        for name, value in vars(s).items():
-            values.setdefault(_kind(s), {}).setdefault(name, set()).add(value)
-    several_observations = len({s.observation for s, _ in pairs}) > 1
-    found: Groups = {}
-    for s, run in sorted(pairs, key=lambda pair: (*_kind(pair[0]), pair[0].seed)):
-        own = {name: v for name, v in vars(s).items() if name not in LIMITS and len(values[_kind(s)][name]) > 1}
-        variant = ", ".join(f"{name} {value}" for name, value in own.items())
-        road = label(s.scenario) + (f", {s.traffic} cars" if len(traffics[s.scenario]) > 1 else "")
-        name = NAMES[s.learner] + (f" on {s.observation}" if several_observations else "")
-        row: Row = {"scenario": label(s.scenario), "learner": s.learner, "variant": variant}
-        row |= {name: getattr(s, name) for name in ("traffic", "observation", "seed")}
-        if run:
-            row |= {name: value for name, value in run.figures.items() if math.isfinite(value)}
-            row |= {"champion_sha256": run.champion_sha256, "run": run.folder}
-        found.setdefault((road, f"{name}, {variant}" if variant else name), []).append(row)
-    return found
+        made = {run.settings: run for run in runs}
+        planned = plan.planned(Path())
+        runs = [made.get(run.settings) or Run(run.path, run.settings, "", {}) for run in planned]
+    of_learner: dict[tuple[str, int, str, str], list[Run]] = {}  # on a road
+    for run in runs:
+        s = run.settings
+        of_learner.setdefault((s.scenario, s.traffic, s.learner, s.observation), []).append(run)
+    groups: Groups = {}
+    for (scenario, traffic, learner, observation), alike in of_learner.items():
+        several_traffics = len({other for name, other, *_ in of_learner if name == scenario}) > 1
+        several_observations = len({other for *_, other in of_learner}) > 1
+        road = label(scenario) + (f", {traffic} cars" if several_traffics else "")
+        words = NAMES[learner] + (f" on {observation}" if several_observations else "")
+        varied = [name for name in vars(alike[0].settings) if len({getattr(run.settings, name) for run in alike}) > 1]
+        for run in alike:
+            own = [f"{name} {getattr(run.settings, name)}" for name in varied if name not in LIMITS]
+            groups.setdefault((road, ", ".join([words, *own])), []).append(run)
+    return groups
 
 
-def _kind(s: RunSettings) -> tuple[object, ...]:
-    """What distinguishes a learner on a road, in the order of the tables: that of the registry and of NAMES."""
-    return [*REGISTRY, s.scenario].index(s.scenario), s.scenario, s.traffic, [*NAMES].index(s.learner), s.observation
-
-
-def quartiles(rows: Sequence[Row], figure: str) -> tuple[list[float], tuple[float, float, float]]:
-    """The runs' values of a figure, and their quartiles; nan if there are none."""
-    values = [row[figure] for row in rows if figure in row]
+def quartiles(runs: Sequence[Run], figure: str) -> tuple[list[float], tuple[float, float, float]]:
+    """The runs' finite values of a figure, and their quartiles; nan if there are none."""
+    values = [run.figures[figure] for run in runs if math.isfinite(run.figures.get(figure, math.nan))]
     lower, median, upper = np.quantile(values or [math.nan], [0.25, 0.5, 0.75]).tolist()
     return values, (lower, median, upper)
 
@@ -94,11 +77,11 @@ def quartiles(rows: Sequence[Row], figure: str) -> tuple[list[float], tuple[floa
 def table(groups: Groups, columns: Columns, spread: bool = True) -> list[list[str]]:
     """Header and rows of a table: road, learner, seeds and the columns; with `spread`, quartiles beside the medians."""
     lines = [["road", "learner", "seeds", *columns]]
-    for names, rows in groups.items():
-        done = sum("run" in row for row in rows)
-        lines.append([*names, f"{done}" if done == len(rows) else f"{done} of {len(rows)}" if done else "missing"])
+    for names, runs in groups.items():
+        done = sum(bool(run.figures) for run in runs)
+        lines.append([*names, f"{done}" if done == len(runs) else f"{done} of {len(runs)}" if done else "missing"])
         for figure, scale, digits in columns.values():
-            values, found = quartiles(rows, figure)
+            values, found = quartiles(runs, figure)
             lower, median, upper = (f"{scale * value:,.{digits}f}" for value in found)
             lines[-1].append(
                 f"{median} ({lower} to {upper})" if spread and len(values) > 1 else median if values else "–"
@@ -108,12 +91,21 @@ def table(groups: Groups, columns: Columns, spread: bool = True) -> list[list[st
 
 def table_csv(groups: Groups, folder: Path) -> bytes:
     """A line for each run, without rounding; a missing run has no figures. Paths are relative to `folder`."""
+    lines: list[dict[str, object]] = []
+    for (_, learner), runs in groups.items():
+        for run in runs:
+            s, figures = run.settings, {**dict.fromkeys((*RUN_FIGURES, *ERROR_FIGURES), math.nan), **run.figures}
+            lines.append({
+                "scenario": label(s.scenario), "traffic": s.traffic, "observation": s.observation,
+                "learner": s.learner, "variant": learner.partition(", ")[2], "seed": s.seed,
+                **{name: value if math.isfinite(value) else "" for name, value in figures.items()},
+                "champion_sha256": run.champion_sha256,
+                "run": os.path.relpath(run.folder, folder) if run.figures else "",
+            })  # fmt: skip
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
+    writer = csv.DictWriter(stream, lines[0], lineterminator="\n")
     writer.writeheader()
-    for row in (row for rows in groups.values() for row in rows):
-        run = row.get("run", "")
-        writer.writerow(row | {"run": run.relative_to(folder) if run and run.is_relative_to(folder) else run})
+    writer.writerows(lines)
     return stream.getvalue().encode(errors="surrogateescape")
 
 
@@ -130,7 +122,7 @@ def table_md(groups: Groups, plan: Plan | None = None) -> bytes:
 
 def notes(groups: Groups) -> list[str]:
     """What to keep in mind when reading the tables."""
-    few = min(sum("run" in row for row in rows) for rows in groups.values()) < FEW
+    few = min(sum(bool(run.figures) for run in runs) for runs in groups.values()) < FEW
     return [
         "Medians over seeds, quartiles in brackets."
         + (f" Fewer than {FEW} seeds are too few for a verdict." if few else ""),

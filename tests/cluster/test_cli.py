@@ -15,7 +15,7 @@ from commands import BIN, all_in_mlflow, descendants, finish, refused, rows, sam
 
 from cluster.commands.cli import dqn_main, evolve_main
 from cluster.commands.compare import compare_main
-from cluster.compare.plan import ComparisonFolder, Plan
+from cluster.compare.plan import Plan, write_plan
 from cluster.settings import EvolveSettings
 from cluster.store.champion import Champion
 from cluster.store.checkpoint import save
@@ -282,7 +282,7 @@ def test_config_of_a_run_that_began_with_a_champion_begins_with_it_again(monkeyp
 @pytest.mark.parametrize("main", [evolve_main, compare_main])
 def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, monkeypatch, capsys, tmp_path):
     RunFolder(tmp_path, EvolveSettings("curved")).write_config()
-    ComparisonFolder(tmp_path, Plan(("curved",), ("dqn",), 1, budget="1k")).write()
+    write_plan(tmp_path, Plan(("curved",), ("dqn",), 1, budget="1k"))
     hold = f"from cluster.store.folder import lock, Path; lock(Path({str(tmp_path)!r})); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout

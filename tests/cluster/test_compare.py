@@ -1,11 +1,9 @@
 """The command gridsim-compare: wrong use, what is never trained again, failures, Ctrl-C, a kill."""
 
 import csv
-import io
 import json
 import os
 import signal
-import time
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -15,15 +13,11 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
 from commands import call, command_line, descendants, finish, refused, running, summary, wait_until
-from finished_runs import make_run
-from rich.console import Console
+from finished_runs import make_run, with_errors
 
 from cluster.commands import compare
-from cluster.commands.compare import Progress, compare_main
-from cluster.compare import processes, results
-from cluster.compare.plan import ComparisonFolder, Plan
-from cluster.compare.processes import RunProcess
-from cluster.workers import kernels
+from cluster.commands.compare import compare_main
+from cluster.compare.plan import Plan, write_plan
 from gridsim import evolve
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
@@ -43,14 +37,13 @@ if [ -e "away-$name" ]; then echo "gridsim-evolve: warning: not logged to MLflow
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    ComparisonFolder(tmp_path, PLAN).write()
+    write_plan(tmp_path, PLAN)
     make_run(tmp_path / "a")
     wrong: list[tuple[list[object], str]] = [
-        (["nowhere"], "no such folder"),
+        (["nowhere"], "not a run's folder"),
         (["."], "none of its runs is finished"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
-        (["--learners", "dqn", "--population", -5], "--population must be 0 to"),
         (["--jobs", 0], "--jobs must be 1 to 256, not 0"),
         (["--resume", "a"], "not a comparison's folder"),
         (["--resume", ".", "--seeds", 1], "contradicts the comparison's 2"),
@@ -67,54 +60,52 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
 def made(tmp_path, monkeypatch, capsys):
     """gridsim-compare in `tmp_path`, with STAND_IN in place of the learners' commands and without MLflow."""
     monkeypatch.chdir(tmp_path)
-    script = tmp_path / "stand-in"
+    script = tmp_path / "gridsim-evolve"  # beside `call`'s gridsim-compare
     script.write_text(STAND_IN)
     script.chmod(0o755)
     for planned in PLAN.planned(tmp_path / "made"):
         make_run(planned.path, settings=planned.settings)
-    monkeypatch.setattr(processes, "_script", lambda command: script)
-    monkeypatch.setattr(kernels, "is_compiled", lambda settings: True)
-    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     tracking: Any = Mock(uri="http://u:hunter2@h:5000", error="no answer", run_id="", close=lambda status: None)
     tracking.wait_id.return_value = "17"
+    monkeypatch.setattr(compare, "measured", with_errors)
     monkeypatch.setattr(compare, "check_uri", lambda *_: tracking.uri)
     monkeypatch.setattr(compare, "Tracking", lambda *_: tracking)
     return SimpleNamespace(run=partial(call, compare_main, monkeypatch, capsys), tracking=tracking)
 
 
-def asked(tmp_path):
-    return [line.split()[0] for line in (tmp_path / "asked").read_text().splitlines()]
-
-
 def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(tmp_path, made):
+    def asked():
+        return [line.split()[0] for line in (tmp_path / "asked").read_text().splitlines()]
+
     names = [planned.name for planned in PLAN.planned(tmp_path)]
-    for failing in (f"broken-{names[2]}", f"killed-{names[3]}"):
-        (tmp_path / failing).touch()
+    for kind, name in zip(("away", "broken", "killed"), names[1:4], strict=True):
+        (tmp_path / f"{kind}-{name}").touch()
     code, out, err = made.run(*ASKED, "--name", "c", "--seeds", 1)
-    assert code == 1
-    assert asked(tmp_path) == names[:4]
-    assert f"run 2/4  {names[1]}: success 50%, 90 m, velocity error 2.5 %, 6 s  ETA 0:00\n" in out
+    assert (code, asked()) == (1, names[:4])
+    assert f"run 2/4  {names[1]}: success 50%, 90 m, 6 s  ETA 0:" in out
     for line in (
         f"{names[0]}: warning: MLflow is slow",
-        f"gridsim-compare: {names[2]} failed: the workers are gone",
+        f"{names[2]}: error: the workers are gone",
         f"gridsim-compare: {names[3]} failed: its process ended with exit code -9; see runs/c/logs/{names[3]}.log",
         "gridsim-compare: error: 2 of 4 runs failed",
     ):
         assert line in err.splitlines()
     assert err.splitlines()[-1].endswith("--resume runs/c")
-    for failing in tmp_path.glob("[bk][ri]*-*"):
-        failing.unlink()
-    champion = tmp_path / "runs/c" / names[0] / "config.json"
-    whole = champion.read_text()
-    champion.write_text(whole.replace('"sigma": 0.5', '"sigma": 0.25'))
-    code, out, err = made.run("--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--jobs", 3)
-    assert (code, sorted(asked(tmp_path)[4:])) == (1, sorted(names[2:]))
+    for kind, name in zip(("away", "broken", "killed"), names[1:4], strict=True):
+        (tmp_path / f"{kind}-{name}").unlink()
+    config = tmp_path / "runs/c" / names[0] / "config.json"
+    whole = config.read_text()
+    config.write_text(whole.replace('"sigma": 0.5', '"sigma": 0.25'))
+    code, _, err = made.run("--resume", "runs/c")
+    assert code == 2
+    assert f"{config.parent} is not what comparison.json asks for" in err
+    config.write_text(whole)
+    code, out, _ = made.run("--resume", "runs/c", "--seeds", 2, "--jobs", 3)
+    assert code == 0
     assert "comparing 8 runs, 2 of them finished" in out
-    assert f"gridsim-compare: {names[0]} failed: {champion.parent} is not what comparison.json asks for" in err
-    assert "| curved | evolution | 1 of 2 |" in (tmp_path / "runs/c/table.md").read_text()
-    champion.write_text(whole)
+    assert sorted(asked()[4:]) == sorted(names[1:]), "one of the finished ones to send what MLflow lacks of it"
     assert made.run("--resume", "runs/c")[0] == 0
-    assert len(asked(tmp_path)) == 10
+    assert len(asked()) == 4 + 7
     assert {"comparison.html", "table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
     assert made.run("runs/c", f"runs/c/{names[0]}", "--name", "again")[0] == 0
@@ -134,41 +125,7 @@ def test_a_run_gets_the_password_and_the_parent_of_its_mlflow_run_in_its_environ
         assert f" --{flag} " in f"{flags} "
     made.tracking.wait_id.return_value = ""
     made.run(*budget, "--name", "d")
-    assert (tmp_path / "asked").read_text().endswith(" {}\n")
-
-
-def test_what_mlflow_lacks_of_a_finished_run_is_sent_as_the_comparison_is_resumed(tmp_path, made):
-    names = [planned.name for planned in PLAN.planned(tmp_path)][:4]
-    (tmp_path / f"away-{names[1]}").touch()
-    assert made.run(*ASKED, "--name", "c", "--seeds", 1)[0] == 0
-    (tmp_path / f"away-{names[1]}").unlink()
-    for _ in range(2):
-        assert made.run("--resume", "runs/c")[0] == 0
-        assert asked(tmp_path) == [*names, names[1]]
-
-
-@pytest.mark.parametrize("width", [60, 80, 120])
-def test_the_live_display_shows_the_newest_row_of_each_run_and_an_eta(width, tmp_path, monkeypatch):
-    folder = ComparisonFolder(tmp_path, Plan(("roundabout",), ("two-parents",), 3, budget="3700s"))
-    screen = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
-    shown, both = Progress(screen, folder, 3, 2), []
-    for planned in folder.planned()[:2]:
-        planned.path.mkdir()
-        both.append(Mock(spec=RunProcess, run=planned, began=time.perf_counter()))
-        both[-1].newest_row = partial(RunProcess.newest_row, both[-1])
-    names = "generation", "distance_m/best", "distance_m/mean", "target_m", "speed_mps/best", "validation/success_rate"
-    history = ",".join(names) + "\n" + "10,1.0,1.0,150.0,1.0,0.0\n" * 1000 + "11,1812.3,1300.0,2000.0,7.1,0.37\n12,18"
-    (both[1].run.path / "history.csv").write_text(history)
-    shown.show(both)
-    lines = ["".join(part.text for part in line) for line in screen.render_lines(shown.get_renderable(), pad=False)]
-    assert lines[:2] == ["run 0/3  ETA 1:32:30", "roundabout-two-parents-s0  starting"]
-    newest = (
-        "roundabout-two-parents-s1  12 generations  success 37%  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
-    )
-    assert lines[2:] == [newest if len(newest) <= width else newest[: width - 1] + "…"]
-    monkeypatch.setattr(compare.time, "perf_counter", partial(lambda now: now + 600.0, time.perf_counter()))
-    shown.show(both)
-    assert "ETA 1:22:30" in str(shown.get_renderable())
+    assert (tmp_path / "asked").read_text().endswith(" {}\n"), "its runs do not probe MLflow again"
 
 
 def processes_of(process):
@@ -195,7 +152,7 @@ def test_a_comparison_that_is_stopped_and_killed_goes_on_to_the_champions_of_eac
     assert "gridsim-compare --resume runs/c" in errors
     assert len(children) == 2
     assert not any(child.is_running() for child in children), "it has waited until they were saved"
-    assert not any(run.finished() for run in planned)
+    assert not any((run.path / "summary.json").exists() for run in planned)
     with running("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path) as process:
         children = wait_until(lambda: len(found := processes_of(process)) == 2 and found, 60)
         wait_until(lambda: all("continuing" in log.read_text() for log in folder.glob("logs/*s[01].log")), 60)

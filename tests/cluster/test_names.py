@@ -13,13 +13,13 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 import pytest
 from commands import BIN, PATH, call, finish, refused
-from finished_runs import make_run
+from finished_runs import make_run, with_errors
 from pictures import small_map
 
+from cluster.commands import compare
 from cluster.commands.cli import dqn_main, evaluate_main, evolve_main
 from cluster.commands.compare import compare_main
 from cluster.commands.watch import watch_main
-from cluster.compare import results
 from cluster.report import pictures
 from gridsim.state import CAR_FIELDS as FIELDS
 
@@ -132,7 +132,7 @@ def test_names_of_any_bytes_are_drawn_and_compared(tmp_path, monkeypatch, capsys
     (tmp_path / "run").rename(tmp_path / name)
     (tmp_path / name / "drive.html").touch()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(compare, "measured", with_errors)
     assert call(compare_main, monkeypatch, capsys, name, "--name", "c")[0] == 0
     (link,) = re.findall(rb'<a href="(.*?)">', (tmp_path / "runs/c/comparison.html").read_bytes())
     assert unquote_to_bytes(unescape(link.decode())) == os.fsencode(f"../../{name}/drive.html")
