@@ -79,7 +79,7 @@ def map_digest(name: str) -> str:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read and check a map's YAML; for a picture alone, use defaults. Raises: GridSimError."""
+    """Read and check a map's YAML; for a picture alone, use defaults."""
     suffix = path.suffix.lower()
     if suffix in PICTURES:
         return MapFile(path)
@@ -109,7 +109,7 @@ def _shown(value: object) -> str:
 
 
 def _bytes(path: Path) -> bytes:
-    """A file's bytes. Raises: GridSimError if it cannot be read."""
+    """A file's bytes."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -188,10 +188,7 @@ def _image_path(path: Path, image: Any) -> Path:
 
 
 def read_free(file: MapFile) -> np.ndarray:
-    """Which pixels are road: bool [rows, columns], the lowest row first.
-
-    Raises: GridSimError if the picture is unreadable, too large, all road or all wall.
-    """
+    """Which pixels are road: bool [rows, columns], the lowest row first."""
     data = _bytes(file.image)
     try:
         with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
