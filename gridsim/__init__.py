@@ -12,8 +12,7 @@ from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
-_SCENARIOS = ("highway", "curved", "seamless", "roundabout", "city")
-ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in _SCENARIOS}
+ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in ("highway", "curved", "seamless", "roundabout", "city")}
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"

@@ -6,7 +6,6 @@ Numba's index of a cache is a pickle. So whoever can write it, or can replace a 
 from __future__ import annotations
 
 import contextlib
-import errno
 import grp
 import os
 import pwd
@@ -32,40 +31,31 @@ def cache_folder(name: str) -> Path:
     """
     named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     problems: list[str] = []
-    for place in (_in_users_cache, _in_temporary, _in_private):
+    for place in (lambda: Path(named or Path.home() / ".cache"), _in_temporary, _in_private):
         try:
-            parent = place()
-            folder = _closed(parent / name)
+            parent = place().resolve()
+            folder = _closed(parent / "gridsim" / name)
         except (OSError, RuntimeError) as error:  # RuntimeError: no home folder, or links in a circle
-            where, reason = getattr(error, "filename", None), getattr(error, "strerror", None) or str(error)
-            problems.append(f"{where}: {reason}" if where else reason)
+            problems.append(str(error))
             continue
-        text = ""
-        if place is _in_private:
-            text = f"kernels are compiled anew each time ({'; '.join(problems)}); {_REMEDY}"
-        elif problems and named:
-            text = f"compiled kernels are kept in {parent.parent} ({problems[0]}); {_REMEDY}"
-        if text:
-            os.environ[VARIABLE] = str(parent.parent)  # child processes use it without another warning
-            warnings.warn(text, stacklevel=2)
+        if problems and (named or place is _in_private):
+            anew = place is _in_private
+            kept = "kernels are compiled anew each time" if anew else f"compiled kernels are kept in {parent}"
+            os.environ[VARIABLE] = str(parent)  # child processes use it without another warning
+            warnings.warn(f"{kept} ({'; '.join(problems)}); {_REMEDY}", stacklevel=2)
         return folder
     raise GridSimError(f"no folder can keep compiled kernels ({'; '.join(problems)}); {_REMEDY}")
 
 
-def _in_users_cache() -> Path:
-    named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(named, "gridsim").resolve()
-
-
 def _in_temporary() -> Path:
-    return Path(tempfile.gettempdir()).resolve() / f"gridsim-{os.geteuid()}" / "gridsim"
+    return Path(tempfile.gettempdir(), f"gridsim-{os.geteuid()}")
 
 
 def _in_private() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="gridsim-kernels-")).resolve()
+    folder = tempfile.mkdtemp(prefix="gridsim-kernels-")
     # Only this process runs it, not its forks; and commands run it, too, which skip `atexit` (`entry`).
     Finalize(None, shutil.rmtree, [folder], {"ignore_errors": True}, exitpriority=0)
-    return folder / "gridsim"
+    return Path(folder)
 
 
 def _closed(folder: Path) -> Path:
@@ -80,13 +70,13 @@ def _closed(folder: Path) -> Path:
         writable = info.st_mode & stat.S_IWOTH or (info.st_mode & stat.S_IWGRP and not _is_own_group(info.st_gid))
         sticky = info.st_mode & stat.S_ISVTX  # as /tmp: others can add to it, but not replace what is there
         if not stat.S_ISDIR(info.st_mode):
-            raise NotADirectoryError(errno.ENOTDIR, "it is a link or a file", str(path))
+            raise OSError(f"{path}: it is a link or a file")
         if info.st_uid not in (trusted if path != folder else {user}):
-            raise PermissionError(errno.EPERM, "it belongs to another user", str(path))
+            raise OSError(f"{path}: it belongs to another user")
         if writable and (path == folder or not sticky):
-            raise PermissionError(errno.EPERM, "other users can write to it", str(path))
+            raise OSError(f"{path}: other users can write to it")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(errno.EACCES, "it cannot be written", str(folder))
+        raise OSError(f"{folder}: it cannot be written")
     return folder
 
 

@@ -29,13 +29,12 @@ KERNEL_PACKAGES = ("gridsim", "evolution")
 
 
 def _sources() -> list[Path]:
-    """Folders of the packages that may contain kernels. Ray unpacks each package into a folder of its own."""
+    """Folders of those packages. Ray unpacks each package into a folder of its own."""
     own = Path(__file__).parent
     try:
-        evolution = package_folder("evolution")
+        return [own, package_folder("evolution")]
     except GridSimError:  # The simulator also works beside a user's file of that name, with the same kernels.
-        evolution = own.parent / "evolution"
-    return [own] if evolution is None else [own, evolution]
+        return [own, own.parent / "evolution"]
 
 
 def kernel_digest() -> str:
@@ -81,16 +80,14 @@ class KernelCache(FunctionCache):
     """Numba's cache of a kernel, without which a run goes on: damaged files and full disks only cost time."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled kernel, or None if it is not in the cache or its files are damaged, which are then emptied."""
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling raises
+        except Exception:  # whatever unpickling of a damaged file raises: compile it, and save it anew
             with contextlib.suppress(OSError):
                 self.flush()
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save the compiled kernel, or warn once that kernels cannot be saved."""
         try:
             super().save_overload(sig, data)
         except Exception as error:  # an OSError, or a damaged index that could not be emptied

@@ -11,19 +11,19 @@ from gridsim.errors import GridSimError
 _FILES = {"cluster": "api.py", "evolution": "episodes/rollout.py"}
 
 
-def package_folder(name: str) -> Path | None:
-    """The folder of GridSim's package `cluster` or `evolution`, which is not imported; None where there is none.
+def package_folder(name: str) -> Path:
+    """The folder of GridSim's package `cluster` or `evolution`, which is not imported.
 
-    Raises: GridSimError, which names what hides it.
+    Raises: GridSimError if it is missing; if a user's file hides it, the message names that.
     """
     spec = find_spec(name)
     if spec is None:
-        return None
+        raise GridSimError(f"GridSim's package {name} is not installed")
     folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
     for folder in folders:
         if (folder / _FILES[name]).is_file():
             return folder
-    hiding = Path(spec.origin) if spec.origin and not folders else folders[0]
+    hiding = folders[0] if folders else spec.origin
     raise GridSimError(f"{hiding} hides GridSim's package {name}: rename it, or move it to another folder")
 
 

@@ -91,8 +91,6 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
 
     Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to the
     steering limit to one side, since the reference's angle is 0 on a straight.
-
-    Raises: GridSimError, a ValueError, if nothing was driven.
     """
     parts = [part for part in parts if len(part.arc) > 1]
     metres = sum(float(part.arc[-1] - part.arc[0]) for part in parts)
@@ -123,8 +121,6 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
 
     The reference begins with the agent's speed and ignores traffic. Its curvature is that of the driven path over 10 m:
     an agent that weaves in longer waves slows it down, so look at both errors.
-
-    Raises: ValueError if the car never moved forward.
     """
     poses = np.asarray(poses, dtype=np.float64)
     steps = road_map.shortest(np.diff(poses[:, :2], axis=0))

@@ -105,7 +105,7 @@ class Simulator:
         max_steps: int | None = None,
         traffic: int = 0,
     ):
-        """Make room for `cars` cars, each with a world of `traffic` other cars. Raises: ValueError.
+        """Make room for `cars` cars, each with a world of `traffic` other cars.
 
         `target` (m) and `max_steps` (control steps) are the configuration's unless given.
         """
@@ -153,15 +153,12 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
-        Raises: ValueError for a wrong shape or a start that is not finite.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
         starts, traffic = starts.astype(np.float32), (len(cars), *self.worlds.shape[1:])
         if len(maps) != len(cars) or starts.shape != (len(cars), 5):
             raise ValueError(f"there are {len(cars)} cars, not {len(maps)} maps and starts of shape {starts.shape}")
-        if not np.isfinite(starts).all():
-            raise ValueError("starts must be finite numbers")
         if worlds is not None and worlds.shape != traffic:
             raise ValueError(f"traffic must be {traffic[0]} worlds of {traffic[1]} cars, not {worlds.shape}")
         self.ends[cars] = End.RUNNING
@@ -189,13 +186,12 @@ class Simulator:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
         self.maps.update(zip(cars.tolist(), maps, strict=True))
         before = self._rows.copy()
-        if set(maps) <= self._row_of.keys():
-            self._rows[cars] = [self._row_of[each] for each in maps]
-        else:
+        if not set(maps) <= self._row_of.keys():
             kept = self._row_of if len(self) > 1 and len(self._row_of) < MOST_MAPS else ()
             wanted = dict.fromkeys([*kept, *self.maps.values()])
             self._row_of, self._physics = {each: row for row, each in enumerate(wanted)}, None
-            self._rows[list(self.maps)] = [self._row_of[each] for each in self.maps.values()]
+            cars, maps = np.array([*self.maps]), [*self.maps.values()]
+        self._rows[cars] = [self._row_of[each] for each in maps]
         if (self._rows != before).any():
             self._groups = _by_map(self._rows)
 
@@ -204,7 +200,6 @@ class Simulator:
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
         Returns: the rewards float32 [n], 0 where no episode was going on.
-        Raises: ValueError for invalid actions; RuntimeError before the first reset.
         """
         if self._rows.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
@@ -232,16 +227,11 @@ def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
 
 
 def checked_actions(actions: np.ndarray) -> np.ndarray:
-    """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous.
-
-    Raises: ValueError unless they are whole numbers that name actions, or pairs of numbers.
-    """
+    """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous."""
     array = np.asarray(actions)
     if array.ndim == 2:
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"continuous actions must be numbers, not {array.dtype}")
-        if np.isnan(array).any():
-            raise ValueError("continuous actions must be numbers, not nan")
+        if array.dtype.kind not in "fiu" or np.isnan(array).any():
+            raise ValueError("continuous actions must be numbers, and not nan")
         return np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
     wrong = (array < 0) | (array >= len(Action)) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
     if wrong.any():

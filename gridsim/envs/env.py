@@ -105,32 +105,30 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 it only where there is a display.
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
-        Raises: ValueError for an invalid argument.
         """
         check_name(scenario)
         for name, value, known in (
             ("observation", observation, ("rays", "grid", "image")),
             ("actions", actions, ("discrete", "continuous")),
             ("render_mode", render_mode, (None, "rgb_array", "human")),
+            (
+                "autoreset_mode",
+                getattr(autoreset_mode, "value", autoreset_mode),
+                [mode.value for mode in AutoresetMode],
+            ),
         ):
             if value not in known:
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
         if not 1 <= frames <= MAX_FRAMES or (frames > 1 and observation == "rays"):
             raise ValueError(f"frames must be 1 to {MAX_FRAMES}, and more than 1 only for grids, not {frames}")
-        for name, asked in (("motion", motion), ("steering", steering)):
-            if asked and observation != "rays":
-                raise ValueError(f"{name} is only for rays; leave it out with observation={observation!r}")
+        if (motion or steering) and observation != "rays":
+            raise ValueError(f"motion and steering are only for rays; leave them out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if map_seed < 0:
             raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            values = ", ".join(mode.value for mode in AutoresetMode)
-            raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}") from None
-        self.num_envs = num_envs
-        self.config = config or SimConfig()
+        self.num_envs, self.config = num_envs, config or SimConfig()
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array", "human"] if render_mode == "human" or has_display() else ["rgb_array"],
             "render_fps": 1.0 / self.config.episode.control_period,
@@ -145,16 +143,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
         self._observer = Observer(self.simulator, observation, frames, motion, steering)
         self.single_observation_space = self._observer.space
-        self.single_action_space: Discrete | Box = Discrete(len(Action))
-        if actions == "continuous":
-            self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
+        continuous = actions == "continuous"
+        self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32) if continuous else Discrete(len(Action))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeded = self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy has its own renderers and its own window."""
-        return {**vars(self), "_views": {}, "_window": None}
+        return {**vars(self), "_views": {}, "_window": None}  # a copy has its own renderers and its own window
 
     def reset(
         self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -167,7 +163,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars, once all have
                 been reset. Later episodes are drawn as usual.
         Returns: (observations of all cars, info, whose masks say which cars were reset).
-        Raises: ValueError for an unknown or invalid option.
         """
         known, options = ("map_seed", "start", "reset_mask"), options or {}
         for name in options:
@@ -196,7 +191,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
-        Raises: gymnasium.error.ResetNeeded where a reset is up to the caller; ValueError for invalid actions.
+        Raises: gymnasium.error.ResetNeeded where a reset is up to the caller.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
@@ -209,9 +204,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
         rewards = self.simulator.step(actions)
         if begun.any():
-            which = np.flatnonzero(begun)
-            self._episodes.numbers[which] += U(1)
-            self._begin(which)
+            self._begin_next(np.flatnonzero(begun))
         self._note(slice(None), begun)
         observations, info, ends = self._observer.look(), self._info(), self.simulator.ends
         terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
@@ -245,14 +238,18 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self.simulator.forget_maps()
         self.simulator.reset(maps, starts, which, worlds)
 
+    def _begin_next(self, which: np.ndarray) -> None:
+        """Begin the next episodes of cars `which`."""
+        self._episodes.numbers[which] += U(1)
+        self._begin(which)
+
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
         which = np.flatnonzero(over)
         last = np.full(self.num_envs, None, dtype=object)
         for i in which.tolist():
             last[i] = copy.deepcopy(row(observations, i))
-        self._episodes.numbers[which] += U(1)
-        self._begin(which)
+        self._begin_next(which)
         self._note(which, over)
         seen = self._observer.look(which)
         if isinstance(seen, dict):
@@ -293,10 +290,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._views[road_map].draw(car, boxes, self.simulator.ranges[i], path, (text,))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """With `rgb_array`, a picture uint8 [height, width, 3] for each car; `human` is drawn by step and reset.
-
-        Raises: gymnasium.error.ResetNeeded before the first reset.
-        """
+        """With `rgb_array`, a picture uint8 [height, width, 3] for each car; `human` is drawn by step and reset."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render_mode; use gymnasium.make(id, render_mode='rgb_array')")
             return None
@@ -307,7 +301,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return tuple(self._picture(i) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the window."""
         if self._window is not None:
             self._window.close()
             self._window = None
@@ -369,10 +362,7 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         return row(observations, 0), self._own(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One control period. Returns: (observation, reward, terminated, truncated, info).
-
-        Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError for an invalid action.
-        """
+        """One control period. Returns: (observation, reward, terminated, truncated, info)."""
         if self.cars.simulator.ends[0] != End.RUNNING:
             raise ResetNeeded("step() was called after the episode's end; call reset() first")
         observations, rewards, terminations, truncations, info = self.cars.step(np.asarray(action)[None])

@@ -44,7 +44,7 @@ class Episodes:
     def __init__(
         self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, traffic: int, config: SimConfig
     ):
-        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed. Raises: ValueError."""
+        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed."""
         self.scenario, self.traffic, self.config = scenario, traffic, config
         if isinstance(maps, int) and is_map_file(scenario):
             maps = [build(scenario, map_seed, config)] * min(maps, 1)
@@ -109,10 +109,10 @@ class Episodes:
         if not np.isfinite(starts).all():
             raise ValueError(f"start must be five finite numbers, not {start!r}")
         for road_map, (x, y, _, speed, steering) in zip(maps, starts, strict=True):
-            if not -vehicle.reverse_limit <= speed <= vehicle.speed_limit:
-                raise ValueError(f"a start's speed must be within the car's limits, not {speed:g} m/s")
-            if abs(steering) > np.radians(vehicle.steering_limit) + 1e-6:
-                raise ValueError(f"a start's steering must be within the car's limits, not {steering:g} rad")
+            fast = not -vehicle.reverse_limit <= speed <= vehicle.speed_limit
+            if fast or abs(steering) > np.radians(vehicle.steering_limit) + 1e-6:
+                limits = "speed and steering must be within the car's limits"
+                raise ValueError(f"a start's {limits}, not {speed:g} m/s and {steering:g} rad")
             if clearance(road_map.road, x, y) < 0.0:
                 raise ValueError(f"a start must be on the road, not at {x:g} m, {y:g} m")
         return starts

@@ -28,10 +28,7 @@ class SB3VecEnv(VecEnv):
         self.metadata = self.cars.metadata  # SB3's has no pictures a second, and its films would then have 30
 
     def reset(self) -> Any:
-        """Begin an episode of each car, with the seeds and options set since the last reset.
-
-        Returns: observations. Raises: ValueError for invalid options, or if only some cars have them.
-        """
+        """Begin an episode of each car, with the seeds and options set since the last reset. Returns: observations."""
         names = self._options[0].keys()
         if any(own.keys() != names for own in self._options):
             raise ValueError("set_options must name the same options for every car")

@@ -24,38 +24,27 @@ class Atlas(NamedTuple):
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     """Concatenate maps. A single field, which may be large, is not copied."""
-    names = [name for name in Network._fields if name not in ("width", "height")]
-    lanes = {name: freeze(np.concatenate([getattr(network, name) for network in networks])) for name in names}
+    *columns, width, height = zip(*networks, strict=True)
+    lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0]])
     fields = [road.field for road in roads]
     lengths = [
-        (len(road.field), len(network.points), len(network.steps), len(network.crossings))
-        for road, network in zip(roads, networks, strict=True)
+        (len(r.field), len(n.points), len(n.steps), len(n.crossings)) for r, n in zip(roads, networks, strict=True)
     ]
+    sizes = [(r.width, r.height, r.speed_low, r.speed_high, r.thinnest) for r in roads]
     return Atlas(
         field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
-        lanes=Network(**lanes, width=networks[0].width, height=networks[0].height),
+        lanes=lanes,
         bounds=freeze(np.cumsum([(0, 0, 0, 0), *lengths], axis=0, dtype=np.int64)),
-        sides=freeze(np.array([[r.columns, r.rows] for r in roads], dtype=np.uint32)),
-        sizes=freeze(
-            np.array([[r.width, r.height, r.speed_low, r.speed_high, r.thinnest] for r in roads], dtype=np.float32)
-        ),
+        sides=freeze(np.array([(r.columns, r.rows) for r in roads], dtype=np.uint32)),
+        sizes=freeze(np.array(sizes, dtype=np.float32)),
     )
 
 
 @njit
 def road_of(atlas: Atlas, m: int) -> Road:
     """Map m of an atlas."""
-    here, there = atlas.bounds[m], atlas.bounds[m + 1]
-    return Road(
-        atlas.field[here[0] : there[0]],
-        atlas.sides[m, 0],
-        atlas.sides[m, 1],
-        atlas.sizes[m, 0],
-        atlas.sizes[m, 1],
-        atlas.sizes[m, 2],
-        atlas.sizes[m, 3],
-        atlas.sizes[m, 4],
-    )
+    field, sides, sizes = atlas.field[atlas.bounds[m, 0] : atlas.bounds[m + 1, 0]], atlas.sides[m], atlas.sizes[m]
+    return Road(field, sides[0], sides[1], sizes[0], sizes[1], sizes[2], sizes[3], sizes[4])
 
 
 @njit

@@ -14,8 +14,8 @@ import io
 import math
 import os
 import reprlib
-import stat
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,11 +36,11 @@ PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp
 YAMLS = (".yaml", ".yml")
 KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed"]
 
-MAX_YAML = 1 << 16  # bytes
-MAX_IMAGE = 1 << 27  # bytes
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
-RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
+# Limits, from and to.
+RESOLUTION = (0.01, 1.0)  # m a pixel
+PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
 SHORTEST_SIDE = 16  # m
 MOST_BORDER = 0.5  # share of road on a picture's border from which the picture is taken to be inverted
 
@@ -59,7 +59,7 @@ class MapFile:
     negate: bool = False  # whether dark pixels are road
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
-    starts: tuple[tuple[float, float, float], ...] = ()
+    starts: Sequence[Sequence[float]] = ()
     speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
 
 
@@ -79,7 +79,7 @@ def map_digest(name: str) -> str:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read and check a map's YAML; for a picture alone, use defaults. Raises: GridSimError."""
+    """Read and check a map's YAML; for a picture alone, use defaults."""
     suffix = path.suffix.lower()
     if suffix in PICTURES:
         return MapFile(path)
@@ -109,40 +109,31 @@ def _shown(value: object) -> str:
 
 
 def _bytes(path: Path) -> bytes:
-    """A file's bytes. Raises: GridSimError if it is not a file, too large or unreadable."""
-    limit = MAX_YAML if path.suffix.lower() in YAMLS else MAX_IMAGE
+    """A file's bytes."""
     try:
-        status = path.stat()
-        regular = stat.S_ISREG(status.st_mode)
-        if regular and status.st_size <= limit:
-            with path.open("rb") as file:
-                return file.read(limit)  # the file may have grown since
+        return path.read_bytes()
     except OSError as error:
         raise GridSimError(f"{path}: {error.strerror or error}") from None
     except ValueError:
         raise GridSimError(f"{_shown(str(path))} is not a valid path") from None
-    if not regular:
-        raise GridSimError(f"{path}: not a file")
-    raise GridSimError(f"{path}: it has {status.st_size:,} bytes; the limit is {limit:,}")
 
 
 def _number(value: Any, what: str, low: float, high: float) -> float:
     """A number within limits, also from text: YAML 1.1 reads 5e-2 as a string, ROS as a number."""
-    number = value
-    if isinstance(value, str):
-        try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-    if isinstance(number, bool) or not isinstance(number, int | float) or not low <= number <= high:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not low <= number <= high:
         raise ValueError(f"{what} must be a number from {low:g} to {high:g}, not {_shown(value)}")
-    return float(number)
+    return number
 
 
-def _list(value: Any, what: str, length: int) -> list[Any]:
-    if not isinstance(value, list) or len(value) != length:
-        raise ValueError(f"{what} must be a list of {length} numbers, not {_shown(value)}")
-    return value
+def _numbers(value: Any, what: str, *limits: tuple[float, float]) -> list[float]:
+    """A list of numbers, each within its limits."""
+    if not isinstance(value, list) or len(value) != len(limits):
+        raise ValueError(f"{what} must be a list of {len(limits)} numbers, not {_shown(value)}")
+    return [_number(each, what, *limit) for each, limit in zip(value, limits, strict=True)]
 
 
 def _checked(path: Path, values: Any) -> MapFile:
@@ -154,64 +145,50 @@ def _checked(path: Path, values: Any) -> MapFile:
         raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
     if "image" not in values or "resolution" not in values:
         raise ValueError("it needs an image, and its resolution (m a pixel)")
-    resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
-    mode = values.get("mode", "trinary")
+    mode, negate, starts = values.get("mode", "trinary"), values.get("negate", 0), values.get("starts", [])
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
-    origin = _list(values.get("origin", [0.0, 0.0, 0.0]), "origin", 3)
-    x, y, yaw = (_number(value, "origin's x, y (m) and yaw (rad)", -1e7, 1e7) for value in origin)
+    if negate not in (0, 1):
+        raise ValueError(f"negate must be true or false, not {_shown(negate)}")
+    if not isinstance(starts, list):
+        raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
+    x, y, yaw = _numbers(values.get("origin", [0, 0, 0]), "origin's x, y (m) and yaw (rad)", PLACE, PLACE, TURN)
     if abs(yaw) > 1e-6:
         raise ValueError(f"origin's yaw must be 0, not {yaw:g}; turn the picture instead")
     free = _number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
     occupied = _number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
     if not 0.0 < free <= occupied:
         raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
-    speed = _list(values.get("speed", list(FILE_SPEEDS)), "speed", 2)
-    low, high = (_number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit) for value in speed)
+    pace = 0.0, VehicleConfig().speed_limit
+    low, high = _numbers(values.get("speed", list(FILE_SPEEDS)), "speed (m/s)", pace, pace)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
-    negate = values.get("negate", 0)
-    if negate not in (0, 1):
-        raise ValueError(f"negate must be true or false, not {_shown(negate)}")
-    starts = values.get("starts", [])
-    if not isinstance(starts, list):
-        raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
     return MapFile(
         image=_image_path(path, values["image"]),
-        resolution=resolution,
+        resolution=_number(values["resolution"], "resolution (m a pixel)", *RESOLUTION),
         origin=(x, y),
         negate=bool(negate),
         free_thresh=free,
-        starts=tuple(_start(value) for value in starts),
+        starts=[_numbers(start, "a start's x, y (m) and heading (rad)", PLACE, PLACE, TURN) for start in starts],
         speed=(low, high),
     )
-
-
-def _start(value: Any) -> tuple[float, float, float]:
-    x, y, heading = _list(value, "a start", 3)
-    x, y = _number(x, "a start's x (m)", -1e8, 1e8), _number(y, "a start's y (m)", -1e8, 1e8)
-    return x, y, _number(heading, "a start's heading (rad)", -2 * math.pi, 2 * math.pi)
 
 
 def _image_path(path: Path, image: Any) -> Path:
     """The path of a YAML's picture, which must be in the YAML's folder or below."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
         raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {_shown(image)}")
-    folder = path.parent
     try:
-        inside = not Path(image).is_absolute() and (folder / image).resolve().is_relative_to(folder.resolve())
+        inside = (path.parent / image).resolve().is_relative_to(path.parent.resolve())
     except (OSError, ValueError, RuntimeError):  # a null character, a link to itself
         raise ValueError(f"image: {_shown(image)} is not a valid path") from None
     if not inside:
         raise ValueError(f"image: {_shown(image)} must lie in the YAML's own folder or below it")
-    return folder / image
+    return path.parent / image
 
 
 def read_free(file: MapFile) -> np.ndarray:
-    """Which pixels are road: bool [rows, columns], the lowest row first.
-
-    Raises: GridSimError if the picture is unreadable, too large, all road or all wall.
-    """
+    """Which pixels are road: bool [rows, columns], the lowest row first."""
     data = _bytes(file.image)
     try:
         with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):

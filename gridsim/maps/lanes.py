@@ -154,8 +154,6 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
 
     Each group of `abreast` consecutive paths runs side by side, from left to right. Lanes of a group have the same
     number of points and are neighbours. `speeds`, `clear` and `room` are 0.
-
-    Raises: ValueError if a lane has no successor.
     """
     n, sides = len(paths), np.array([width, height], dtype=np.float64)
     lengths = np.array([sum(length for length, _ in path.pieces) for path in paths])

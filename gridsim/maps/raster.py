@@ -151,10 +151,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 
 
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
-
-    Raises: ValueError if a car fits nowhere along a road.
-    """
+    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car."""
     nodes, corner = _window(nodes)
     labels, _ = ndimage.label(nodes >= vehicle.width / 2 + _MARGIN)
     extent = [math.hypot(*(side.stop - side.start for side in box)) * _NODE for box in ndimage.find_objects(labels)]

@@ -162,10 +162,7 @@ def clearances(road, points):
 
 
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
-    """Clearance float32 [rows, columns] at the nodes of the field, in m.
-
-    Raises: ValueError if a side is not a power of two.
-    """
+    """Clearance float32 [rows, columns] at the nodes of the field, in m; the sides must be powers of two."""
     columns, rows = round(width * CELLS_PER_M), round(height * CELLS_PER_M)
     if columns.bit_count() != 1 or rows.bit_count() != 1:
         raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")

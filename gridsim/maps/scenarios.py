@@ -77,10 +77,7 @@ def seed_of_map(name: str, seed: int) -> int:
 
 
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
-    """Build a scenario's map from a seed; the same seed gives the same map.
-
-    Raises: GridSimError for an unknown scenario, a negative seed, or an invalid map file.
-    """
+    """Build a scenario's map from a seed; the same seed gives the same map."""
     check_name(name)
     if seed < 0:
         raise GridSimError(f"a seed must be 0 or more, not {seed}")

@@ -24,16 +24,10 @@ from gridsim.state import DISTANCE, LANE, SPEED, STEPS, End, X, Y, poses_of
 from gridsim.traffic.world import spawn
 from gridsim.view.render import Renderer, Window, interpolate
 
-COLUMNS = (
-    "time_s",  # since the episode's start
-    "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action",
-    "episode",  # index in the file; a restart begins the next one
-    "traffic",  # other cars
-    "scenario", "map_seed",
-)  # fmt: skip
-"""The columns of a recorded drive."""
+# The columns of a recorded drive: the time is since the episode's start, and a restart begins the next episode.
+_POSE = ("x_m", "y_m", "heading_rad", "speed_mps", "steering_rad")
+COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed")
 MAX_TRAFFIC = 1000  # of a drive that is read
-MAX_BYTES = 1 << 28  # of a file that is read
 LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
 PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
@@ -45,10 +39,7 @@ HELP = "arrows drive   space brakes   R restarts   Esc ends"
 
 @dataclass(frozen=True)
 class Drive:
-    """A recorded drive; n control steps of one or more episodes on one map.
-
-    Map and episode determine where the other cars begin.
-    """
+    """A recorded drive: n control steps on one map; map and episode determine where the other cars begin."""
 
     scenario: str
     map_seed: int
@@ -116,18 +107,12 @@ class Recorder:
         self.rows += 1
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
 
 def read_drive(path: str | os.PathLike[str]) -> Drive:
-    """Read a drive that `gridsim-drive --record` wrote.
-
-    Raises: GridSimError that names the first problem and its place.
-    """
+    """Read a drive that `gridsim-drive --record` wrote. Raises: GridSimError that names the first problem."""
     try:
-        if os.stat(path).st_size > MAX_BYTES:
-            raise GridSimError(f"{path}: too large for a recorded drive")
         with open(path, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, restval="", strict=True)
             try:
@@ -197,8 +182,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
 
 
 def _present(world: np.ndarray) -> np.ndarray:
-    """The cars [n, TRAFFIC_FIELDS] of a world that are on a lane: a copy."""
-    return world[world[:, LANE] >= 0.0]
+    return world[world[:, LANE] >= 0.0]  # a copy
 
 
 def drive(

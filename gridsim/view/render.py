@@ -102,7 +102,6 @@ class Renderer:
         if ranges is not None:
             shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64)))
         if boxes is not None:
-            boxes = np.asarray(boxes, dtype=np.float64)
             shapes.append(self._placed(self._other, boxes[:, :2], boxes[:, 2:4]))
         own = paint.car_parts(*self._outline, float(car[STEERING]), paint.EGO)
         shapes.append(self._placed(own, position[None], heading[None]))
@@ -231,7 +230,7 @@ class Window:
     _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
-        """Open it. Raises: NoDisplayError that says what to do."""
+        """Open it. Raises: NoDisplayError."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
 
@@ -259,9 +258,8 @@ class Window:
 
     def show(self, image: np.ndarray, fps: float) -> None:
         """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps`."""
-        pygame = self._pygame
         height, width = image.shape[:2]
-        picture = pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB")
+        picture = self._pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB")
         self._window.get_surface().blit(picture, (0, 0))
         self._window.flip()
         self._clock.tick(fps)
@@ -289,7 +287,6 @@ class Window:
         return pressed, pressed | watched
 
     def close(self) -> None:
-        """Close it."""
         if self._open.pop(self._window, None):
             self._window.destroy()
             self._quit_unused()

@@ -1,7 +1,5 @@
 """The drivable area: the fields that kernels read, against the exact geometry of the strips."""
 
-import math
-
 import numpy as np
 import oracle
 import pytest
@@ -18,21 +16,6 @@ CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field c
 @pytest.fixture(scope="module")
 def scenario(maps):
     return maps["seamless"][0]
-
-
-def test_the_oracle_knows_a_ring_and_a_strip():
-    _, ring = small_map(arcs=[[32, 32, 10, 1.0, 2 * math.pi, 3]])
-    points = [[42, 32], [45, 32], [46, 32], [32, 39], [32, 38], [32, 24.5]]
-    assert ring.clearance(np.array(points, dtype=float)) == pytest.approx([3, 0, -1, 0, -1, 0.5])
-    # From the middle of the ring outwards, inwards, and along the tangent to the outer edge.
-    ranges = ring.cast(np.array([[42.0, 32.0]]), np.array([[0.0, math.pi, math.pi / 2]]), 50.0)
-    assert ranges[0] == pytest.approx([3.0, 3.0, math.sqrt(13**2 - 10**2)])
-    _, strip = small_map(lines=[[0, 32, 64, 32, 4]])  # goes round the torus
-    ranges = strip.cast(np.array([[60.0, 33.0]]), np.array([[0.0, math.pi / 2, -math.pi / 6]]), 50.0)
-    assert ranges[0] == pytest.approx([50.0, 3.0, 10.0])
-    poses = [[60, 32, 0], [60, 35, 0], [60, 35.01, 0], [60, 33.9, math.pi / 2], [60, 34.1, math.pi / 2]]
-    on_road = strip.outline_on_road(np.array(poses, dtype=float), 2.0, 1.0)
-    assert on_road.tolist() == [True, True, False, True, False]
 
 
 inside, half_width = st.floats(0, SIDE), st.floats(0.5, 6.0)
@@ -57,12 +40,6 @@ def test_the_world_is_a_torus(scenario, x, y, i, j):
     x, y = x / 64, y / 64  # so that no bit is lost further out
     here, there = read(scenario.road, [[x, y], [x + 256 * i, y + 256 * j]])
     assert here == there
-
-
-def test_sides_that_do_not_fit_are_refused():
-    for width, height in ((96.0, 64.0), (64.0, 100.0), (0.0, 64.0)):
-        with pytest.raises(ValueError, match="powers of two"):
-            clearance_nodes(Strips.of(), width, height)
 
 
 def test_clearance_on_a_straight_edge_is_exact_to_rounding_and_saturates():

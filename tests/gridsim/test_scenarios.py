@@ -17,10 +17,9 @@ from gridsim.config import CROSSING_GAP
 from gridsim.errors import GridSimError
 from gridsim.jit import freeze
 from gridsim.maps.generators import curved, highway, roundabout
-from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.simulator import Simulator
 from gridsim.state import SPEED, End
 
@@ -290,19 +289,3 @@ def test_parked_cars_stand_beside_the_lanes():
         # No two overlap: centres along and across the street.
         apart = np.abs(wrapped(blocks[:, None, :2] - blocks[:, :2], m.sides)).max(axis=2)
         assert apart[~np.eye(len(blocks), dtype=bool)].min() > 4.1
-
-
-def test_a_lane_that_leads_nowhere_is_refused():
-    with pytest.raises(ValueError, match="another begins"):
-        lay_lanes([Path(0.0, 0.0, 0.0, ((10.0, 0.0),))], 64.0, 64.0)
-
-
-@pytest.mark.parametrize("name", sorted(REGISTRY))
-def test_boxes_are_as_large_as_their_lanes(name):
-    """What is nowhere near a lane's box is not looked for on the lane."""
-    network = build(name, HELD_OUT_SEED).network
-    for first, stop, (x, y, half_x, half_y) in zip(network.offsets, network.offsets[1:], network.boxes, strict=False):
-        points = network.points[first:stop].astype(float)
-        reach = np.abs(points - [x, y]).max(axis=0)
-        assert (reach <= [half_x, half_y]).all()
-        assert [half_x, half_y] == pytest.approx(reach, abs=2e-3)

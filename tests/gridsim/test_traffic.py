@@ -315,14 +315,6 @@ def test_of_two_that_cross_one_waits(crossing, offset):
         assert not (inside & (lane[:, i] == 3 * i + 1)).any()
 
 
-@pytest.mark.parametrize("width", [2.0, 2.2, 3.0])
-def test_a_lane_is_blocked_until_a_crossing_car_of_any_width_is_past(width):
-    """Points are 1 m apart, and the lanes cross 8 m along the junction's."""
-    config = SimConfig(vehicle=VehicleConfig(width=width))
-    network = network_of(crossing_paths(), 256.0, 256.0, config=config)
-    assert (network.clear == 8.0 + math.floor(width + CONFIG.traffic.beside)).all()
-
-
 @pytest.mark.parametrize("speed", [4.0, 8.0, 15.0])
 @pytest.mark.parametrize("phase", np.arange(0.0, 15.0, 2.5))
 def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
