@@ -87,8 +87,8 @@ def read_comparison(folder: Path) -> Content:
     params = {name: " ".join(v) if isinstance(v, tuple) else str(v) for name, v in vars(comparison.plan).items()}
     files = [folder / name for name in (COMPARISON, REPORT, TABLE, ROWS, PICTURE)]
     return Content(
-        name=folder.name, params=params, tags={"algorithm": "comparison"}, note="",
+        name=folder.name, params=params, tags={"algorithm": "comparison"},
         rows=[(done, {"runs_done": float(done)}, wall_s) for done, wall_s in enumerate(times, 1)],
-        files=[path for path in files if path.is_file()], model=None,
+        files=[path for path in files if path.is_file()],
         finished=len(ended) == len(planned), wall_s=max(times, default=0.0),
     )  # fmt: skip
