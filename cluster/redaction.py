@@ -13,25 +13,21 @@ _HARMLESS = (
 )  # fmt: skip
 """Parameters of a query that are shown; no list of the secret ones would be complete."""
 _SECRET = "pass|pw|token|secret|key|cred|sig|auth|odbc_connect"  # in names, as error texts have them
-_HOST = re.compile(r"[^/@:]+(:\d+)?|\[[^/@\]]+\](:\d+)?")
 
 
 def redacted(uri: str) -> str:
     """An address without user and password, without a fragment, and with harmless query parameters alone.
 
-    A password may hold an @ or a slash, so that user and password end with the last @. Only behind a complete host of a
-    web address an @ belongs to the path. Behind a question mark it may belong to a password as well as to a parameter:
-    then the address is shown as its scheme and `UNCLEAR`.
+    A password may hold an @ or a slash, so that user and password end with the last @. An @ behind a question mark may
+    belong to a password as well as to a parameter: then the address is shown as its scheme and `UNCLEAR`.
     """
     start, rest = re.fullmatch(r"((?:[\w.+-]*:)?//|)(.*)", uri, re.DOTALL).groups()  # type: ignore[union-attr]
     head, mark, query = rest.partition("?")
-    web, file = start.lower().startswith("http"), rest.startswith("/")
-    if "@" in rest and not file and (start or ":" in rest.partition("@")[0]):
-        if "@" in query and re.search("[:@]", head):
-            return f"{start}{UNCLEAR}"
-        if not (web and _HOST.fullmatch(head.partition("/")[0])):
-            head = head.rpartition("@")[2]
-    if web:
+    if "@" in query:
+        return f"{start}{UNCLEAR}"
+    if not head.startswith("/"):  # no file's name
+        head = head.rpartition("@")[2]
+    if start.lower().startswith("http"):
         head = re.split("[#;]", head, maxsplit=1)[0]
     parts = query.partition("#")[0].split("&")
     kept = "&".join(part for part in parts if urllib.parse.unquote_plus(part.partition("=")[0]).lower() in _HARMLESS)
@@ -48,15 +44,11 @@ def one_line(error: BaseException, uri: str = "") -> str:
         return text
     if uri:
         text = text.replace(uri, redacted(uri))
-    reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text)
-    if reasons:
+    if reasons := re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text):
         return reasons[-1].strip()
     if "timed out" in text.lower():
         return "no answer in time"
-    lines = text.splitlines()
-    # SQLAlchemy may put a hint of its own before what went wrong.
-    line = lines[1] if text.startswith("(raised as") and len(lines) > 1 else lines[0]
     # Up to the last @ of the line, as a password may hold a space.
-    line = re.sub(r"([\w.+-]*:?//)[^@]*:.*@", r"\1", line)
+    line = re.sub(r"([\w.+-]*:?//)[^@]*:.*@", r"\1", text.splitlines()[0])
     line = re.sub(r"[\w.+-]*:?//\S+|\S*:\S*@\S*", lambda address: redacted(address[0]), line)
     return re.sub(rf"([\w.%-]*(?:{_SECRET})[\w.%-]*['\"]?)(\s*[=:]\s*)\S+", r"\1\2...", line, flags=re.IGNORECASE)[:200]

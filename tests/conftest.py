@@ -51,9 +51,9 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
     from tracked import client
 
-    from cluster.tracking.database import create_database, silence_mlflow
+    from cluster.tracking.database import configure_mlflow, create_database
 
-    silence_mlflow()
+    configure_mlflow()
     path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
     create_database(path)
     client(f"sqlite:///{path}").create_experiment("other", artifact_location=(path.parent / "mlartifacts").as_uri())

@@ -9,7 +9,7 @@ import sys
 import time
 
 from cluster.redaction import one_line
-from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, reach_loopback_directly, server_problem
+from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, reach_loopback_directly, unreachable
 from cluster.tracking.database import run_tables
 
 STOP_S = 10.0  # that the server may take to end
@@ -39,7 +39,7 @@ def main(port: str) -> None:
         process_group=0,  # so that a terminal's signals end it here, with all of its processes
     )
     try:
-        while server.poll() is None and server_problem(address):
+        while server.poll() is None and unreachable(address):
             time.sleep(0.2)
         if server.poll() is None:
             links = [f"runs of {name}: {table}" for name, table in tables.items()]

@@ -83,7 +83,7 @@ def read_comparison(folder: Path) -> Content:
     times = sorted((path / SUMMARY).stat().st_mtime - started for path in done)
     files = [folder / name for name in (COMPARISON, REPORT, TABLE, ROWS, PICTURE)]
     return Content(
-        name=folder.name, note="", tags={"algorithm": "comparison"},
+        name=folder.name, tags={"algorithm": "comparison"},
         params={name: " ".join(v) if isinstance(v, tuple) else str(v) for name, v in vars(plan).items()},
         rows=[(done, {"runs_done": float(done)}, wall_s) for done, wall_s in enumerate(times, 1)],
         files=[path for path in files if path.is_file()],

@@ -4,7 +4,6 @@ An address is probed before MLflow is imported: with a dead one MLflow would han
 """
 
 import contextlib
-import functools
 import importlib.util
 import os
 import re
@@ -24,10 +23,13 @@ from gridsim.errors import GridSimError
 DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
+_SERVERS = ("http", "https")
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
 _HOSTED = "databricks"  # a scheme of MLflow's own; others come with plug-ins
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 _PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a gateway in front of MLflow
+_SQLITE = re.compile(r"sqlite(\+\w+)?:///(.+?)(?:\?([\w.-]+=[^/]*))?", re.IGNORECASE | re.DOTALL)
+"""Driver, path and query. A path may have a question mark, too."""
 
 
 class TrackingError(GridSimError):
@@ -37,46 +39,38 @@ class TrackingError(GridSimError):
 def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
-    If `uri` is None or "": the address `begun_with` of a resumed run, whose server is not probed, as the run goes on
-    without it and the tracker reports it; else MLFLOW_TRACKING_URI, else `sqlite:///mlflow.db` in the working
-    directory. A password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI.
-    A run of a comparison, which has MLFLOW_RUN_CONTEXT, does not probe it again: its server may be away meanwhile.
-    Hosted stores (`databricks`, the schemes of MLflow's plug-ins) are not probed.
+    If `uri` is None or "": the address `begun_with` of a resumed run, else MLFLOW_TRACKING_URI, else DEFAULT_URI. A
+    password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI. Not probed are the server of a
+    resumed run and of a run of a comparison (MLFLOW_RUN_CONTEXT), which go on without it, and hosted stores.
     Raises TrackingError for a server that does not answer, a database that cannot be written or is another MLflow's, a
     folder (MLflow 3 stores nothing in folders) and anything unknown.
     """
     reach_loopback_directly()
     probed = (not uri and bool(begun_with)) or "MLFLOW_RUN_CONTEXT" in os.environ
     uri = with_password(uri or begun_with) or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
-    scheme = address_scheme(uri)
+    scheme, shown = address_scheme(uri), redacted(uri)
     if scheme == "sqlite":
         return _check_sqlite(uri)
     if scheme == _HOSTED or scheme in entry_points(group="mlflow.tracking_store").names:
         return uri
-    if probed and scheme in ("http", "https", *_DATABASES):
-        return uri
-    if scheme in ("http", "https"):
-        uri = uri.rstrip("/")
-        if problem := unreachable(uri):
-            raise TrackingError(f"no MLflow server at {redacted(uri)}: {problem}; start one, or use {DEFAULT_URI}")
-        return uri
-    if scheme in _DATABASES:
-        if redacted(uri).endswith(UNCLEAR):
-            raise TrackingError(f"{redacted(uri)}: in a password, write ? as %3F, @ as %40 and / as %2F")
-        if problem := unreachable(uri):
-            raise TrackingError(f"no database server at {redacted(uri)}: {problem}")
-        return uri
     if scheme in ("", "file"):
-        use = f"use {DEFAULT_URI} or http://host:port"
-        raise TrackingError(f"{redacted(uri)}: MLflow 3 keeps no runs in folders; {use}")
-    raise TrackingError(f"{redacted(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
+        raise TrackingError(f"{shown}: MLflow 3 keeps no runs in folders; use {DEFAULT_URI} or http://host:port")
+    if scheme not in (*_SERVERS, *_DATABASES):
+        raise TrackingError(f"{shown}: not a tracking address; use {DEFAULT_URI} or http://host:port")
+    if shown.endswith(UNCLEAR):
+        raise TrackingError(f"{shown}: in a password, write ? as %3F, @ as %40 and / as %2F")
+    uri = uri.rstrip("/")
+    if not probed and (problem := unreachable(uri)):
+        kind = "database" if scheme in _DATABASES else "MLflow"
+        raise TrackingError(f"no {kind} server at {redacted(uri)}: {problem}; start one, or use {DEFAULT_URI}")
+    return uri
 
 
 def unreachable(uri: str) -> str:
     """Why the server of an address, MLflow's or a database's, does not answer now; "" for all other addresses."""
     scheme = address_scheme(uri)
-    if scheme in ("http", "https"):
-        return server_problem(uri.rstrip("/"))
+    if scheme in _SERVERS:
+        return _server_problem(redacted(uri))
     if scheme in _DATABASES:
         parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
         try:
@@ -85,6 +79,21 @@ def unreachable(uri: str) -> str:
         except (OSError, ValueError) as error:
             return one_line(error, uri)
     return ""
+
+
+def _server_problem(uri: str) -> str:
+    """Why there is no MLflow server at `uri`, or "". Sends no credentials, so certificates are not checked."""
+    unchecked = ssl.create_default_context()
+    unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
+    try:
+        with urllib.request.urlopen(uri + _PAGE, timeout=PROBE_S, context=unchecked) as answer:
+            return "" if answer.read(64).lstrip().startswith(b"{") else "something else answers there"
+    except urllib.error.HTTPError as error:
+        if b"Invalid Host header" in error.read(200):
+            return "it refuses this host name"
+        return "" if error.code in (400, 401, 403, 405, 429) else f"it answers with error {error.code}"
+    except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
+        return one_line(error)
 
 
 def address_scheme(uri: str) -> str:
@@ -113,59 +122,44 @@ def reach_loopback_directly() -> None:
 
     To be called before there are threads, as it changes the environment.
     """
-    proxies = urllib.request.getproxies_environment()
-    excepted = proxies.pop("no", "")
-    names = [name.strip() for name in excepted.split(",") if name.strip()]
-    missing = [name for name in _LOOPBACK if name not in names]
-    if proxies and missing and "*" not in names:
-        os.environ["no_proxy"] = ",".join([*names, *missing])
+    excepted = urllib.request.getproxies_environment().get("no", "")
+    if "*" not in excepted and _LOOPBACK[-1] not in excepted:
+        os.environ["no_proxy"] = ",".join([*filter(None, [excepted]), *_LOOPBACK])
 
 
 def _check_sqlite(uri: str) -> str:
     """The address with an absolute path. Raises TrackingError if the database, or its folder, cannot be written."""
     path, shown = sqlite_path(uri), redacted(uri)
-    if path is None:
+    if path is None or path.is_dir():
         raise TrackingError(f"{shown}: names no file; use {DEFAULT_URI}")
-    if not path.parent.is_dir():
-        raise TrackingError(f"{shown}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise TrackingError(f"{shown}: the folder {path.parent} cannot be written")
-    if path.is_dir():
-        raise TrackingError(f"{shown}: {path} is a folder; name a file")
-    absolute = sqlite_uri(path, _sqlite_parts(uri)[2])
+        raise TrackingError(f"{shown}: there is no folder {path.parent} that can be written; create it first")
+    match = _SQLITE.fullmatch(uri)
+    absolute, found = sqlite_uri(path, match[3] if match else ""), []
     if path.exists() and path.stat().st_size:
-        address, found = f"file:{urllib.parse.quote(str(path))}?mode=rw", []
+        address = f"file:{urllib.parse.quote(str(path))}?mode=rw"
         try:
             with contextlib.closing(sqlite3.connect(address, 0.0, isolation_level=None, uri=True)) as database:
                 database.execute("BEGIN IMMEDIATE")  # fails where writing would; closing undoes it
                 if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'alembic_version'").fetchall():
                     found = database.execute("SELECT version_num FROM alembic_version").fetchall()
         except sqlite3.Error as error:
-            locked = getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
-            if not locked:  # the tracker waits for it
+            if not is_locked(str(error)):  # the tracker waits for it
                 raise TrackingError(f"{shown}: not a database that can be written: {error}") from error
-        if found and (problem := schema_problem(found[0][0], absolute)):
-            raise TrackingError(problem)
+    if found and (problem := schema_problem(found[0][0], absolute)):
+        raise TrackingError(problem)
     return absolute
-
-
-def _sqlite_parts(uri: str) -> tuple[str, str, str]:
-    """Driver, path and query of a SQLite address, or three empty texts. A path may have a question mark, too."""
-    match = re.fullmatch(r"sqlite(\+\w+)?:///(.+?)(?:\?((?:[\w.-]+=[^/&]*&?)+))?", uri, re.IGNORECASE | re.DOTALL)
-    return (match[1] or "", match[2], match[3] or "") if match else ("", "", "")
 
 
 def sqlite_path(uri: str) -> Path | None:
     """The database file of a SQLite address, absolute; None for another kind of address or a database in memory."""
-    driver, text, _ = _sqlite_parts(uri)
-    if not text or ":memory:" in text:
+    match = _SQLITE.fullmatch(uri)
+    if not match or ":memory:" in match[2]:
         return None
-    path = Path(os.path.abspath(text))
-    # SQLAlchemy decodes a path, which users seldom expect.
-    return Path(os.path.abspath(urllib.parse.unquote(text))) if driver or not path.parent.is_dir() else path
+    return Path(os.path.abspath(urllib.parse.unquote(match[2]) if match[1] else match[2]))
 
 
-def sqlite_uri(path: Path, query: str = "") -> str:
+def sqlite_uri(path: Path, query: str | None = None) -> str:
     """The SQLite address of an absolute path.
 
     SQLAlchemy takes a question mark for a query's beginning, and decodes what follows a percent sign. MLflow makes the
@@ -175,49 +169,22 @@ def sqlite_uri(path: Path, query: str = "") -> str:
     return f"sqlite{'+pysqlite' if text != str(path) else ''}:///{text}" + (f"?{query}" if query else "")
 
 
-@functools.cache
-def _schema_revisions() -> tuple[frozenset[str], frozenset[str]]:
-    """Revisions of the database's schema that the installed MLflow knows, and the newest of them."""
-    package = importlib.util.find_spec("mlflow")
-    assert package is not None
-    assert package.origin is not None
-    files = (Path(package.origin).parent / "store/db_migrations/versions").glob("*.py")
-    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
-    known, followed = (
-        frozenset(re.findall(rf"^{name} = ['\"](\w+)", text, re.MULTILINE)) for name in ("revision", "down_revision")
-    )
-    return known, known - followed
-
-
 def schema_problem(revision: str | None, uri: str) -> str:
     """Why a database of this schema is not used, in one line, or "".
 
     MLflow would migrate an older one at once, after which the older MLflow, of others perhaps, cannot open it any more.
     """
-    known, newest = _schema_revisions()
-    if not revision or not newest or revision in newest:
-        return ""
-    if revision not in known:
-        return f"{redacted(uri)} is a database of a newer MLflow, or of another program; use another --tracking-uri"
-    upgrade = f"mlflow db upgrade {shlex.quote(redacted(uri))}"
-    return (
-        f"{redacted(uri)} was made by an older MLflow, which cannot open it once it is upgraded; copy it, then run "
-        f"{upgrade}, or use another --tracking-uri"
+    package = importlib.util.find_spec("mlflow")
+    assert package is not None
+    assert package.origin is not None
+    files = Path(package.origin).parent.glob("store/db_migrations/versions/*.py")
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    known, followed = (
+        set(re.findall(rf"^{name} = ['\"](\w+)", text, re.MULTILINE)) for name in ("revision", "down_revision")
     )
-
-
-def server_problem(uri: str) -> str:
-    """Why there is no MLflow server at `uri`, or "". Sends no credentials, so certificates are not checked."""
-    unchecked = ssl.create_default_context()
-    unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
-    try:
-        with urllib.request.urlopen(redacted(uri) + _PAGE, timeout=PROBE_S, context=unchecked) as answer:
-            return "" if answer.read(64).lstrip().startswith(b"{") else "something else answers there"
-    except urllib.error.HTTPError as error:
-        if b"Invalid Host header" in error.read(200):
-            return "it refuses this host name"
-        if error.code >= 500:
-            return f"it answers with error {error.code}"
-        return "" if error.code in (400, 401, 403, 405, 429) else "something else answers there"
-    except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
-        return one_line(error)
+    if not revision or revision in known - followed:
+        return ""
+    return (
+        f"{redacted(uri)} was made by another version of MLflow, or by another program; use another --tracking-uri, or "
+        f"copy it and run mlflow db upgrade {shlex.quote(redacted(uri))}, after which an older MLflow cannot open it"
+    )

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
+CHAMPION_TAG = "champion_sha256"  # digest of the champion's genome; a run registers a champion once
+
 
 @dataclass(frozen=True)
 class Model:
     """A champion as an ONNX file, and the registered version that it becomes."""
 
     name: str  # of the registered model
-    champion_sha256: str  # digest of the champion's genome; a run registers a champion once
     about: str  # what all versions of the registered model have in common, Markdown
     note: str  # what this version is, Markdown
-    tags: Mapping[str, str]  # the version's, and the saved model's metadata
+    tags: Mapping[str, str]  # the version's, CHAMPION_TAG among them, and the saved model's metadata
     onnx: Path
     example: np.ndarray  # observations float32 [n, inputs]
-    outputs: int  # numbers that the network returns for an observation
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,10 @@ class Content:
     name: str
     params: Mapping[str, str]
     tags: Mapping[str, str]
-    note: str  # description, Markdown; `{run_id}` stands for MLflow's id of the run
     rows: list[tuple[int, Mapping[str, float], float]] = field(default_factory=list)  # step, metrics, wall_s
-    files: list[Path] = field(default_factory=list)
-    model: Model | None = None
+    note: str = ""  # how the description begins, Markdown
+    result: str = ""  # what the description has besides at the end; `{run_id}` stands for MLflow's id of the run
+    files: list[Path] = field(default_factory=list)  # sent at the end
+    model: Model | None = None  # sent at the end
     finished: bool = False  # a finished run's status, end and files in MLflow stay as they are
     wall_s: float = 0.0  # seconds from the start to the last row or the end, without pauses

@@ -1,13 +1,7 @@
-"""MLflow's databases: made whole or not at all, and never migrated. Imports MLflow.
-
-`silence_mlflow` is to be called before MLflow is imported.
-"""
+"""MLflow's databases: made whole or not at all, and never migrated. Imports MLflow."""
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import logging
 import os
 import tempfile
 from pathlib import Path
@@ -15,30 +9,20 @@ from pathlib import Path
 from cluster.tracking.address import TrackingError, is_database, schema_problem, sqlite_path, sqlite_uri
 from cluster.tracking.view import run_table
 
-# Set unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
+# MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {
     "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
 }
-_LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3")
 
 
-def silence_mlflow() -> None:
-    """Keep MLflow from writing to the terminal: its errors reach the caller. What the user has set stays.
-
-    To be called before there are threads, as it changes the environment.
-    """
+def configure_mlflow() -> None:
+    """Set MLflow's variables, before it is imported and before there are threads. What the user has set stays."""
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    for name in _LOGGERS:
-        logger = logging.getLogger(name)
-        if not logger.handlers:
-            logger.addHandler(logging.NullHandler())
-            logger.propagate = False
 
 
 def check_schema(uri: str) -> None:
@@ -49,10 +33,10 @@ def check_schema(uri: str) -> None:
 
     engine = utils.create_sqlalchemy_engine(uri)
     try:
-        problem = schema_problem(utils._get_schema_version(engine), uri)
+        revision = utils._get_schema_version(engine)
     finally:
         engine.dispose()
-    if problem:
+    if problem := schema_problem(revision, uri):
         raise TrackingError(problem)
 
 
@@ -60,19 +44,12 @@ def create_database(path: Path) -> None:
     """Make a new, complete MLflow database appear at `path`, unless another process is first.
 
     MLflow builds it by 60 migrations in a second. If it is killed in the middle, or two runs start together, what is
-    left is a database that it can never open again. So it is built beside, by one process at a time.
+    left is a database that it can never open again. So it is built beside.
     """
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
-    locked = path.with_name(f".{path.name}.lock")
-    with open(locked, "wb") as lock, contextlib.ExitStack() as last:
-        last.callback(locked.unlink, missing_ok=True)
-        # NFS may not lock. Then several processes build a database, and the first one's stays.
-        with contextlib.suppress(OSError):
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        if path.exists():
-            return
-        built = Path(last.enter_context(tempfile.TemporaryDirectory(prefix=".mlflow-", dir=path.parent)), path.name)
+    with tempfile.TemporaryDirectory(prefix=".mlflow-", dir=path.parent) as folder:
+        built = Path(folder, path.name)
         # The second argument is MLflow's default location, which breaks at some folders' names.
         SqlAlchemyStore(sqlite_uri(built), (path.parent / "mlartifacts").as_uri()).engine.dispose()
         try:
@@ -84,13 +61,12 @@ def create_database(path: Path) -> None:
 
 def run_tables(uri: str, server: str) -> dict[str, str]:
     """`run_table` of each experiment that has runs in a store, by name."""
-    silence_mlflow()
+    configure_mlflow()
     from mlflow.tracking import MlflowClient
 
     path = sqlite_path(uri)
     if path and not path.exists():
         return {}
-    check_schema(uri)
     client = MlflowClient(tracking_uri=uri)
     found = [each for each in client.search_experiments() if client.search_runs([each.experiment_id], max_results=1)]
     return {each.name: run_table(server, each.experiment_id) for each in found}

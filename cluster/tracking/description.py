@@ -16,7 +16,7 @@ from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store.champion import load_champion
 from cluster.store.folder import FILES
 from cluster.tracking.address import TrackingError
-from cluster.tracking.content import Content, Model
+from cluster.tracking.content import CHAMPION_TAG, Content, Model
 from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
@@ -57,8 +57,9 @@ def read_run(folder: Path) -> Content | None:
         name=folder.name,
         params={name: str(value) for name, value in asdict(settings).items()},
         tags=tags(settings),
-        note=describe(folder, settings, summary),
         rows=rows,
+        note=f"{headline(settings)}\n\nIts folder: `{folder}`",
+        result=result(folder, settings, summary) if summary else "",
         files=[folder / name for name in FILES if (folder / name).is_file()] if summary else [],
         model=model,
         finished=summary is not None,
@@ -115,15 +116,12 @@ def headline(settings: RunSettings) -> str:
     return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {cars}, seed {settings.seed}."
 
 
-def describe(folder: Path, settings: RunSettings, summary: Mapping[str, Any] | None = None) -> str:
-    """A run's description, Markdown: what it does, and once it is finished its results and how to watch it."""
-    if summary is None:
-        return f"{headline(settings)}\n\nIts folder: `{folder}`"
+def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> str:
+    """A finished run's results and how to watch, load and repeat it, Markdown."""
     held_out, inputs = summary["held_out"], PolicySpec.parse(settings.policy).inputs
     found = "Solved" if summary["solved"] else "The best so far"
     step = f"{settings.step_name}s"
     return "\n\n".join([
-        headline(settings),
         f"{found} after {summary[step]:,} {step}, {summary['car_steps'] / 1e6:,.1f} million car-steps and "
         f"{summary['wall_s']:,.0f} s. On {held_out['episodes']} held-out drives the champion succeeds in "
         f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
@@ -142,14 +140,13 @@ def onnx_model(folder: Path, settings: RunSettings, held_out: Mapping[str, float
     if not (folder / "champion.onnx").is_file():
         return None
     champion = load_champion(folder / "champion.npz")
-    spec = PolicySpec.parse(champion.policy)
     return Model(
         model_name(settings),
-        champion.sha256,
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
         "observations and return a number for each of the eight actions; the action with the greatest is taken.",
         note=f"{headline(settings)} {held_out['held_out/success_rate']:.1%} of the held-out drives succeed.",
         tags={
+            CHAMPION_TAG: champion.sha256,
             "policy": champion.policy,
             "scenario": label(settings.scenario),
             "algorithm": settings.algorithm,
@@ -158,6 +155,5 @@ def onnx_model(folder: Path, settings: RunSettings, held_out: Mapping[str, float
             **{name: f"{value:.6g}" for name, value in held_out.items()},
         },
         onnx=folder / "champion.onnx",
-        example=example(spec, champion.sim),
-        outputs=spec.outputs,
+        example=example(PolicySpec.parse(champion.policy), champion.sim),
     )

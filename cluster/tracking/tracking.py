@@ -51,15 +51,13 @@ class Tracking:
         }  # fmt: skip
         self._experiment_id, self._lacking = "", ["all"]
         self._process: Popen[str] | None = None
-        self._listener = threading.Thread(target=self._listen, name="mlflow", daemon=True)
 
     def start(self) -> None:
         """Start the process. A terminal's signals do not reach it."""
-        self._process = Popen(
-            [sys.executable, "-P", "-m", "cluster.tracking.sync"], text=True, start_new_session=True,
-            stdin=PIPE, stdout=PIPE, stderr=DEVNULL,
-        )  # fmt: skip
+        command = [sys.executable, "-P", "-m", "cluster.tracking.sync"]
+        self._process = Popen(command, text=True, start_new_session=True, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         self._tell(self._order)
+        self._listener = threading.Thread(target=self._listen, args=(self._process,), daemon=True)
         self._listener.start()
 
     def wait_id(self, timeout_s: float) -> str:
@@ -88,9 +86,6 @@ class Tracking:
         lacking, reason = ", ".join(self._lacking), self.error or f"no answer within {timeout_s:g} s"
         self._process.kill()  # if there is nothing to send, it may still be importing MLflow
         self._listener.join()
-        if self._process.stdin:
-            with contextlib.suppress(OSError):  # of a status that was not read
-                self._process.stdin.close()
         return None if nothing or not lacking else f"not logged to MLflow at {redacted(self.uri)}: {lacking}: {reason}"
 
     def where(self, mlflow: str) -> str:
@@ -109,21 +104,21 @@ class Tracking:
     def _tell(self, message: Any) -> None:
         assert self._process
         assert self._process.stdin
-        with contextlib.suppress(OSError):  # it has ended, which `_listen` notices
+        with contextlib.suppress(OSError, ValueError):  # it has ended, which `_listen` notices
             print(json.dumps(message), file=self._process.stdin, flush=True)
 
-    def _listen(self) -> None:
+    def _listen(self, process: Popen[str]) -> None:
         """Take in what the process tells until it ends."""
-        assert self._process
-        assert self._process.stdout
-        with self._process.stdout as answers:
+        assert process.stdin
+        assert process.stdout
+        with process.stdout as answers:
             for line in answers:
                 known = json.loads(line)
-                self._lacking = known["lacking"]
-                if "sent" in known:
-                    self.sent, self.error = known["sent"], known["error"]
-                    self._experiment_id, self.run_id = known["experiment_id"], known["run_id"]
-        if code := self._process.wait():
+                self.sent, self.error, self._lacking = known["sent"], known["error"], known["lacking"]
+                self._experiment_id, self.run_id = known["experiment_id"], known["run_id"]
+        with contextlib.suppress(OSError):  # of a status that was not read
+            process.stdin.close()
+        if code := process.wait():
             self._lacking = self._lacking or ["what is new"]
             self.error = self.error or f"the process that sends has ended with exit code {code}"
 

@@ -20,10 +20,7 @@ def run_table(server: str, experiment_id: str) -> str:
 def view() -> str:
     """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
     columns = {"attributes.`Run Name`": 270, **{f"metrics.`{name}`": width for name, width in _COLUMNS.items()}}
-    state = {
-        "selectedColumns": list(columns),
-        "columnOrder": list(columns),
-        "columnWidths": columns,
-        "globalLineChartConfig": {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0},
-    }
+    axis = {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0}
+    state = {"selectedColumns": list(columns), "columnOrder": list(columns), "columnWidths": columns}
+    state["globalLineChartConfig"] = axis
     return json.dumps({"name": "GridSim", "createdAt": int(1000.0 * time.time()), "state": json.dumps(state)})

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -14,7 +13,7 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 from browser import Browser, needs_chromium
 from commands import finish
-from tracked import MODEL, free_port, row, send, tracking, write_run
+from tracked import MODEL, client, free_port, row, send, tracking, write_run
 
 from cluster.tracking.content import Content
 from cluster.tracking.database import run_tables
@@ -27,34 +26,23 @@ def logged(uri, folder, name, success_rate):
     rows = [(step, row(step) | {"validation/success_rate": 0.25 * step}, float(step)) for step in range(3)]
     rows.append((2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0))
     (folder / name).mkdir()
-    begun = tracking(folder / name, uri, "gridsim", Content(name, {}, {}, "", rows, wall_s=83.0))
+    begun = tracking(folder / name, uri, "gridsim", Content(name, {}, {}, rows, wall_s=83.0))
     assert begun.close("FINISHED") is None
     return begun.where("bin/mlflow")
 
 
-def test_a_run_says_where_its_table_is(uri, tmp_path, monkeypatch):
+def test_a_run_says_where_its_table_is_and_keeps_a_view_that_was_changed(uri, tmp_path, monkeypatch):
+    tag, experiment = "mlflow.sharedViewState.gridsim", client(uri).create_experiment("gridsim")
     said = logged(uri, tmp_path, "first", 0.875)
     table = run_tables(uri, "http://127.0.0.1:5000")["gridsim"]
+    page = f"#/experiments/{experiment}/runs?workflowType=machine_learning&viewStateShareKey=gridsim"
+    assert table == f"http://127.0.0.1:5000/{page}"
     assert said == f"MLFLOW_DISABLE_TELEMETRY=true bin/mlflow ui --backend-store-uri {uri}; then open\n{table}"
-    monkeypatch.chdir(tmp_path / "store")
-    assert (
-        logged(uri, tmp_path, "second", 0.875) == f"make ui, or {said}"
-    )  # which shows the working directory's mlflow.db
-    assert re.fullmatch(
-        r"http://127.0.0.1:5000/#/experiments/\d+/runs\?workflowType=machine_learning&viewStateShareKey=gridsim", table
-    )
-
-
-def test_an_experiment_from_before_gets_the_view_and_keeps_one_that_was_changed(uri, tmp_path):
-    from mlflow.tracking import MlflowClient
-
-    client, tag = MlflowClient(tracking_uri=uri), "mlflow.sharedViewState.gridsim"
-    experiment = client.create_experiment("gridsim")
-    logged(uri, tmp_path, "first", 0.875)
-    assert "held_out/success_rate" in client.get_experiment(experiment).tags[tag]
-    client.set_experiment_tag(experiment, tag, "mine")
-    logged(uri, tmp_path, "second", 0.5)
-    assert client.get_experiment(experiment).tags[tag] == "mine"
+    assert "held_out/success_rate" in client(uri).get_experiment(experiment).tags[tag]
+    client(uri).set_experiment_tag(experiment, tag, "mine")
+    monkeypatch.chdir(tmp_path / "store")  # whose mlflow.db `make ui` shows
+    assert logged(uri, tmp_path, "second", 0.875) == f"make ui, or {said}"
+    assert client(uri).get_experiment(experiment).tags[tag] == "mine"
 
 
 @contextlib.contextmanager

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import queue
 import signal
 import socket
 import subprocess
@@ -15,12 +14,13 @@ from pathlib import Path
 import numpy as np
 from commands import wait_until
 
-import cluster.tracking.sync
+import cluster
 from cluster.settings import EvolveSettings
 from cluster.store.champion import Champion
-from cluster.tracking.address import server_problem
-from cluster.tracking.database import silence_mlflow
+from cluster.tracking.address import unreachable
+from cluster.tracking.database import configure_mlflow
 from cluster.tracking.description import read_run
+from cluster.tracking.sync import serve
 from cluster.tracking.tracking import Tracking, sync
 from evolution.networks.export import to_onnx
 from evolution.networks.policy import PolicySpec
@@ -44,7 +44,6 @@ run = tracking(folder, uri)
 assert time.perf_counter() - started < 1.0, "it waits for MLflow's import"
 report = run.close("FINISHED")
 assert (report is None) == (len(sys.argv) > 3), report
-assert not [name for name in ("torch", "onnxruntime", "matplotlib") if name in sys.modules]
 """
 
 
@@ -52,40 +51,19 @@ class InThisProcess:
     """The process of `tracking.py` as threads of this one, whose MLflow a test can disturb."""
 
     def __init__(self, command, **options):
-        assert command[-1] == "cluster.tracking.sync"
-        silence_mlflow()
-        orders, written = os.pipe()
-        read, answers = os.pipe()
-        self.stdin, self.stdout = os.fdopen(written, "w"), os.fdopen(read)
+        configure_mlflow()
+        (orders, stdin), (stdout, answers) = os.pipe(), os.pipe()
+        self.stdin, self.stdout = os.fdopen(stdin, "w"), os.fdopen(stdout)
         self._orders, self._answers = os.fdopen(orders), os.fdopen(answers, "w", buffering=1)
-        self._lock = threading.Lock()
-        self._ends: queue.SimpleQueue = queue.SimpleQueue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._serve, daemon=True).start()
 
-    def _listen(self):
-        with self._orders:
-            order = json.loads(self._orders.readline())
-            threading.Thread(target=self._serve, args=(order,), daemon=True).start()
-            for line in self._orders:
-                self._ends.put(json.loads(line))
-
-    def _serve(self, order):
-        try:
-            cluster.tracking.sync.serve(order, self._ends, self._tell)
-        except SystemExit:
-            pass
-        except ValueError:  # it was killed
-            assert self._answers.closed
-        finally:
-            self.kill()
-
-    def _tell(self, known):
-        with self._lock:
-            print(json.dumps(known), file=self._answers)
+    def _serve(self):
+        with contextlib.suppress(SystemExit, ValueError):  # by a test; the answers are closed
+            serve(self._orders, self._answers, self._orders.close)
+        self.kill()
 
     def kill(self):
-        with self._lock:
-            self._answers.close()
+        self._answers.close()
 
     def wait(self):
         return 0
@@ -124,13 +102,6 @@ def read_given(folder):
     return GIVEN[folder]
 
 
-def content(folder):
-    """What MLflow is to have of a run's folder."""
-    found = read_run(folder)
-    assert found is not None
-    return found
-
-
 def tracking(folder, uri, experiment="driving", given=None):
     """A run's tracking, started; of what is `given`, if it is, in place of the folder's files."""
     GIVEN[folder] = given
@@ -147,7 +118,7 @@ def send(folder, uri, experiment="driving"):
 
 
 def client(uri):
-    silence_mlflow()
+    configure_mlflow()
     from mlflow.tracking import MlflowClient
 
     return MlflowClient(tracking_uri=uri)
@@ -183,7 +154,7 @@ def mlflow_server(folder, port, *flags):
             [*command, *flags], cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True
         )
     try:
-        wait_until(lambda: not server_problem(f"http://127.0.0.1:{port}"), pause=0.2)
+        wait_until(lambda: not unreachable(f"http://127.0.0.1:{port}"), pause=0.2)
         yield
     finally:
         os.killpg(server.pid, signal.SIGKILL)
