@@ -227,11 +227,11 @@ class Learning(ABC):
         return np.array(rows, dtype=np.float64).reshape(-1, len(self.columns))
 
 
-def finish(progress: Generator[Event, None, Any]) -> Any:
-    """Go through a step, or another part of a run, without showing its progress. Returns: what it returns."""
+def finish(progress: Generator[Event, None, Any], on_event: Callable[[Event], None] = lambda event: None) -> Any:
+    """Go through a step, or another part of a run, telling of its progress. Returns: what it returns."""
     try:
         while True:
-            next(progress)
+            on_event(next(progress))
     except StopIteration as end:
         return end.value
 

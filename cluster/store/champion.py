@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from cluster.settings import MAX_TRAFFIC, EvolveSettings
+from cluster.settings import MAX_TRAFFIC
 from cluster.store import checkpoint
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
-from cluster.store.folder import read_config
+from cluster.store.checkpoint import CHAMPION, CONFIG, CheckpointError
 from cluster.text import as_argument
 from evolution.episodes import rollout
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
@@ -32,21 +31,13 @@ GONE = ("apart", "kerb")  # former parameters of traffic, which older champions 
 
 @dataclass(frozen=True)
 class Champion:
-    """A genome and what is needed to run it.
+    """A genome and what is needed to run it."""
 
-    Attributes:
-        genome: float32 [genes].
-        policy: its network, such as `mlp:6,7`.
-        scenario: where it learned.
-        sim: the simulator's parameters it learned with.
-        traffic: number of other cars it learned among.
-    """
-
-    genome: np.ndarray
-    policy: str
-    scenario: str
-    sim: SimConfig
-    traffic: int = 0
+    genome: np.ndarray  # float32 [genes]
+    policy: str  # its network, such as `mlp:6,7`
+    scenario: str  # where it learned
+    sim: SimConfig  # the simulator's parameters it learned with
+    traffic: int = 0  # other cars that it learned among
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
@@ -90,13 +81,8 @@ class Champion:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if it cannot be written."""
-        meta = {
-            "policy": self.policy,
-            "scenario": self.scenario,
-            "traffic": self.traffic,
-            "sim": dataclasses.asdict(self.sim),
-        }
-        checkpoint.save(path, {"genome": self.genome}, meta)
+        meta = {name: getattr(self, name) for name in ("policy", "scenario", "traffic")}
+        checkpoint.save(path, {"genome": self.genome}, meta | {"sim": dataclasses.asdict(self.sim)})
 
 
 class UnfinishedError(CheckpointError):
@@ -106,12 +92,15 @@ class UnfinishedError(CheckpointError):
 def load_champion(path: str | os.PathLike[str]) -> Champion:
     """Read a champion.npz, given the file or its run's folder.
 
-    Raises: UnfinishedError for a run that has no champion yet, CheckpointError for a file that is missing, damaged,
-    hostile or not a champion.
+    Raises: UnfinishedError for a run without one, CheckpointError for a file that is missing or not a champion.
     """
     path = Path(path)
     if os.path.isdir(path):  # path.is_dir() raises for a name that is too long
-        _check_finished(path)
+        if not (path / CONFIG).is_file() and not (path / CHAMPION).exists():
+            raise CheckpointError(f"{path} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
+        if not (path / CHAMPION).exists():
+            again = f"if it was stopped, continue it with --resume {as_argument(path)}"
+            raise UnfinishedError(f"{path} has no {CHAMPION} yet: it is written when the run ends; {again}")
         path /= CHAMPION
     arrays, meta = checkpoint.load(path)
     if "genome" not in arrays:
@@ -133,22 +122,6 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
-
-
-def _check_finished(run: Path) -> None:
-    """Raises: CheckpointError if a folder has no champion.npz."""
-    if (run / CHAMPION).exists():
-        return
-    if not (run / CONFIG).is_file():
-        raise CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
-    try:
-        command = read_config(run / CONFIG)[0].command
-    except GridSimError:
-        command = EvolveSettings.command
-    again = f"continue it with: {command} --resume {as_argument(run)}"
-    if not (run / CHECKPOINT).is_file():
-        again = f"start it anew with: {command} --config {as_argument(run / CONFIG)}"
-    raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
 
 def evaluate(
