@@ -34,7 +34,7 @@ from cluster.tracking.tracking import Status, Tracking
 from cluster.workers import kernels
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
-from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
+from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VALIDATION_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
 from gridsim.config import SimConfig
 
@@ -209,7 +209,7 @@ class Session:
         champion = Champion(best.genome, settings.policy, settings.scenario, sim, settings.traffic)
         champion.save(path / CHAMPION)
         checkpoint.write_atomic(path / ONNX, to_onnx(learning.spec, best.genome, sim))
-        episodes = learning.held_out_episodes()
+        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
         self.on_event(next(driving))  # the workers drive, and meanwhile:
         write_report(self.run, champion, learning.history, write_elites(path, settings.policy), self.maps.get, episodes)

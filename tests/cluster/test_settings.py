@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from cluster.settings import DqnSettings, EvolveSettings, from_dict
+from evolution.search.base import SearchConfig
 from gridsim.errors import GridSimError
 
 POLICIES = {
@@ -71,6 +72,11 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
     assert replace(usual, generations=500).extending(usual) == EvolveSettings("city", seed=3, generations=500)
     assert usual.extending(usual) == usual
     assert replace(short, generations=10).extending(short) == EvolveSettings(generations=10, car_steps=100)
+
+
+def test_the_search_s_parameters_are_the_settings():
+    settings = EvolveSettings(recombination="two", population=64, tournament=3, sigma=0.7, elites=2, mutation_rate=0.1)
+    assert settings.search_config() == SearchConfig(64, 4, 3, 0.7, 2, 0.1)
 
 
 @pytest.mark.parametrize(("population", "groups"), [(4, 1), (31, 1), (32, 2), (127, 7), (1000, 8)])

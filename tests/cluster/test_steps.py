@@ -7,7 +7,6 @@ import pytest
 from commands import rows
 from learners import session
 
-from cluster import stopping
 from cluster.learn.evolution import Evolution
 from cluster.learn.maps import Maps
 from cluster.settings import EvolveSettings
@@ -84,19 +83,6 @@ def test_a_kill_behind_the_appended_steps_changes_nothing(maps, straight, tmp_pa
     assert found(resumed) == found(straight)
     assert (path / STEPS).stat().st_size == whole
     assert len(rows(path)) == 3
-
-
-def test_a_signal_stops_a_run_between_two_looks_at_the_workers_and_nothing_is_lost(maps, straight, tmp_path):
-    """The second of three generations is saved although its second is not over."""
-    stopped = session(new_run(tmp_path, "stopped", SETTINGS), maps, **EAGER)
-    stopped.on_row = lambda steps, row: stopping._stop(15, None) if steps == 2 else None
-    with pytest.raises(stopping.Stopped):
-        stopped.learn()
-    stopping._asked_at = None
-    assert load(stopped.run.path / CHECKPOINT)[1]["generation"] == len(rows(stopped.run.path)) == 2
-    resumed = session(open_run(stopped.run.path), maps, **EAGER)
-    resumed.learn()
-    assert found(resumed) == found(straight)
 
 
 def test_a_finished_run_can_be_extended_and_is_then_no_longer_finished(maps, ended, straight):
