@@ -85,8 +85,6 @@ class Learning(ABC):
         self.spec = PolicySpec.parse(s.policy)
         self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, s.traffic)
 
-    # ------------------------------------------------------------------------------------------------------ the loop
-
     @abstractmethod
     def step(self) -> Progress:
         """Do one step and add its row to the history, without the wall clock's columns."""
@@ -140,8 +138,6 @@ class Learning(ABC):
             self.champion = Champion(candidate, score, float(success_rate(results)[0]), distance, step)
         self.solved = self.champion.score >= self.settings.until
 
-    # ------------------------------------------------------------------------------------------------- evaluating
-
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
         """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""
         warned, busy = 0, True
@@ -181,8 +177,6 @@ class Learning(ABC):
         row, before = self.history[-1], self.history[-2] if self.steps > 1 else {"car_steps": 0.0, "wall_s": 0.0}
         steps, seconds = row["car_steps"] - before["car_steps"], wall_s - before["wall_s"]
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
-
-    # ------------------------------------------------------------------------------------------------------- state
 
     def state(self) -> State:
         """All that an exact resume needs besides the history, arrays and plain numbers."""
