@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from cluster.settings import MAX_TRAFFIC
+from cluster.settings import MAX_TRAFFIC, EvolveSettings
 from cluster.store import checkpoint
-from cluster.store.checkpoint import CHAMPION, CONFIG, CheckpointError
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
+from cluster.store.folder import read_config
 from cluster.text import as_argument
 from evolution.episodes import rollout
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
@@ -96,11 +97,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
     """
     path = Path(path)
     if os.path.isdir(path):  # path.is_dir() raises for a name that is too long
-        if not (path / CONFIG).is_file() and not (path / CHAMPION).exists():
-            raise CheckpointError(f"{path} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
-        if not (path / CHAMPION).exists():
-            again = f"if it was stopped, continue it with --resume {as_argument(path)}"
-            raise UnfinishedError(f"{path} has no {CHAMPION} yet: it is written when the run ends; {again}")
+        _check_finished(path)
         path /= CHAMPION
     arrays, meta = checkpoint.load(path)
     if "genome" not in arrays:
@@ -122,6 +119,22 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
+
+
+def _check_finished(run: Path) -> None:
+    """Raises: CheckpointError if a folder has no champion.npz."""
+    if (run / CHAMPION).exists():
+        return
+    if not (run / CONFIG).is_file():
+        raise CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
+    try:
+        command = read_config(run / CONFIG)[0].command
+    except GridSimError:
+        command = EvolveSettings.command
+    again = f"continue it with: {command} --resume {as_argument(run)}"
+    if not (run / CHECKPOINT).is_file():
+        again = f"start it anew with: {command} --config {as_argument(run / CONFIG)}"
+    raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
 
 def evaluate(
