@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from cluster import stopping
 from cluster.learn.evolution import Evolution
-from cluster.learn.learning import Event, Learning, State
+from cluster.learn.learning import Event, Learning, State, finish
 from cluster.learn.maps import Maps
 from cluster.redaction import redacted
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
@@ -34,7 +34,7 @@ from cluster.tracking.tracking import Status, Tracking
 from cluster.workers import kernels
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
-from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
+from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VALIDATION_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
 from gridsim.config import SimConfig
 
@@ -141,7 +141,7 @@ class Session:
                 path = run.path / CHECKPOINT
                 raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
             self.started -= learning.history[-1]["wall_s"] if learning.history else 0.0
-            self._steps.write_history(learning.table().tolist(), 0)
+            self._steps.write_history(rows)
         self._state: State | None = None  # after the last step, if it is not saved yet
         self._saved_at = -math.inf
         self._away = False  # whether an outage of MLflow was reported
@@ -181,9 +181,9 @@ class Session:
         learning, first = self.learning, self._steps.number
         table = learning.table(first)
         self._steps.append(table, [learning.elites.pop(k) for k in range(first, learning.steps)])
-        meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, **self._steps.meta()}
+        meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "steps": learning.steps}
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
-        self._steps.write_history(table.tolist(), first)
+        self._steps.write_history(table)
         self._saved_at = perf_counter()
 
     def _report_outage(self) -> None:
@@ -203,17 +203,17 @@ class Session:
 
         learning, path, settings = self.learning, self.run.path, self.run.settings
         self.maps.ahead(HELD_OUT_SEEDS)
-        self._through(learning.choose_champion())
+        finish(learning.choose_champion(), self.on_event)
         best, car_steps, sim = learning.champion, learning.car_steps, learning.sim
         assert best is not None
         champion = Champion(best.genome, settings.policy, settings.scenario, sim, settings.traffic)
         champion.save(path / CHAMPION)
         checkpoint.write_atomic(path / ONNX, to_onnx(learning.spec, best.genome, sim))
-        episodes = learning.held_out_episodes()
+        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
         self.on_event(next(driving))  # the workers drive, and meanwhile:
         write_report(self.run, champion, learning.history, write_elites(path, settings.policy), self.maps.get, episodes)
-        driven = self._through(driving)
+        driven = finish(driving, self.on_event)
         row, wall = learning.history[best.step], self.wall_s()
         self.summary = {
             "name": self.run.name,
@@ -234,21 +234,4 @@ class Session:
             **{f"best_{name}": row[name] for name in ("car_steps", "wall_s")},
             "held_out": summarise(driven.results[0], sim.episode.control_period),
         }
-        self._drop_replay()
         write_summary(path, self.summary)
-
-    def _through(self, progress: Generator[Event, None, Any]) -> Any:
-        """Go through a part of the run, telling of its progress. Returns: what it returns."""
-        while True:
-            try:
-                self.on_event(next(progress))
-            except StopIteration as end:
-                return end.value
-
-    def _drop_replay(self) -> None:
-        """Write a DQN's last checkpoint without the replay buffer, which is most of it; an extended run fills one."""
-        path = self.run.path / CHECKPOINT
-        arrays, meta = checkpoint.load(path)
-        kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
-        if len(kept) < len(arrays):
-            checkpoint.save(path, kept, meta)

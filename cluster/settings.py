@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
@@ -16,15 +17,9 @@ from evolution.search.base import SearchConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
-MAX_WORKERS = 10_000
-MAX_POPULATION = 1_000_000
-MAX_SEED = (1 << 63) - 1
 MAX_TRAFFIC = 100
-MAX_ELITES = 10_000
-MAX_REPLAY = 10_000_000
-LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
-MAX_UPDATES = 1_000_000  # for each thousand car-steps
+LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
@@ -33,7 +28,7 @@ S = TypeVar("S", bound="RunSettings")
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(ABC):
     """What any learner's run depends on: two runs with equal settings have the same champion."""
 
     command: ClassVar[str]  # console script of this learner
@@ -75,9 +70,9 @@ class RunSettings:
         return self.default_policies.get(self.observation, "")
 
     @property
+    @abstractmethod
     def algorithm(self) -> str:
         """What learns: evolution, random or dqn."""
-        raise NotImplementedError
 
     @property
     def learner(self) -> str:
@@ -104,32 +99,28 @@ class RunSettings:
 
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
+        _check_types(type(self), vars(self))
         check_name(self.scenario)
         if is_map_file(self.scenario):
             build(self.scenario, 0)  # cached, so that it is read once
         self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and is_map_file(self.scenario):
             raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
-        self._check_range(0, MAX_SEED, "seed")
+        self._check_range(0, (1 << 63) - 1, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
-        if self.observation not in get_args(Observation):
-            raise GridSimError(f"--observation must be {' or '.join(get_args(Observation))}, not {self.observation}")
         try:
             spec = PolicySpec.parse(self.policy)
         except ValueError as error:
             raise GridSimError(str(error)) from error
         if spec.observation != self.observation:
-            raise GridSimError(
-                f"policy {self.policy} sees the {spec.observation}; "
-                f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
-            )
+            remedy = f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
+            raise GridSimError(f"policy {self.policy} sees the {spec.observation}; {remedy}")
 
     def _check_range(self, least: float, most: float, *names: str) -> None:
-        """Raises GridSimError for a field that is out of its range."""
         for name in names:
             value = getattr(self, name)
             if not least <= value <= most:
@@ -179,15 +170,11 @@ class EvolveSettings(RunSettings):
         if not self.population:
             object.__setattr__(self, "population", 128 if self.traffic else SearchConfig.population)
         if not self.generations and not self.car_steps:
-            object.__setattr__(self, "car_steps", self.default_car_steps())
+            object.__setattr__(self, "car_steps", 60_000_000 if self.traffic else 30_000_000)
 
     def default_policy(self) -> str:
         usual = super().default_policy()
         return usual.replace("+", "+motion+") if self.traffic and self.observation == "rays" else usual
-
-    def default_car_steps(self) -> int:
-        """Used if neither generations nor car-steps are given."""
-        return 60_000_000 if self.traffic else 30_000_000
 
     @property
     def algorithm(self) -> str:
@@ -210,8 +197,8 @@ class EvolveSettings(RunSettings):
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations
         # As for a new run that is given --generations: the default car-steps do not apply.
-        usual = self.car_steps == base.car_steps == self.default_car_steps()
-        return replace(self, car_steps=0) if longer and usual else self
+        usual = replace(self, generations=0, car_steps=0).car_steps
+        return replace(self, car_steps=0) if longer and self.car_steps == base.car_steps == usual else self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
@@ -219,14 +206,13 @@ class EvolveSettings(RunSettings):
     def check(self) -> None:
         super().check()
         self._check_range(0, MAX_STEPS, "generations")
-        self._check_range(4, MAX_POPULATION, "population")
+        self._check_range(4, 1_000_000, "population")
         self._check_range(0, 1, "mutation_rate")
         classic = self.recombination == "two" or self.search == "random"
         for name in ("elites", "mutation_rate"):
             if not classic and getattr(self, name) != getattr(EvolveSettings, name):
                 raise GridSimError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
-        if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
-            raise GridSimError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
+        self._check_range(0, min(10_000, self.population - 1) if classic else 10_000, "elites")
         self._check_range(1, MAX_STEPS, "tournament")
         self._check_positive("sigma")
 
@@ -307,13 +293,10 @@ class DqnSettings(RunSettings):
         self._check_range(0, MAX_STEPS, "episodes")
         self._check_range(0, 1, "discount", "epsilon", "converged")
         self._check_positive("updates", "learning_rate")
-        self._check_range(0, MAX_UPDATES, "updates")
+        self._check_range(0, 1_000_000, "updates")
+        # A batch or more, and more rows than frames.
         least = max(self.batch, getattr(PolicySpec.parse(self.policy), "frames", 1) + 1)
-        if not least <= self.replay <= MAX_REPLAY:
-            needed = "a batch or more, and more rows than frames"
-            raise GridSimError(f"--replay must be {least:,} ({needed}) to {MAX_REPLAY:,}, not {self.replay:,}")
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise GridSimError(f"--device must be auto, cpu or cuda, not {self.device}")
+        self._check_range(least, 10_000_000, "replay")
 
 
 SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
@@ -321,27 +304,28 @@ SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (Evolve
 
 def check_workers(workers: int, patience_s: float) -> None:
     """Raises GridSimError if a run cannot be computed with these values; no result depends on them."""
-    if not 0 <= workers <= MAX_WORKERS:
-        raise GridSimError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
+    if not 0 <= workers <= 10_000:
+        raise GridSimError(f"--workers must be 0 to 10,000, not {workers}")
     if not 0.0 <= patience_s < math.inf:
         raise GridSimError(f"--patience must be 0 or more, not {patience_s:g}")
 
 
 def from_dict(kind: type[S], values: dict[str, Any]) -> S:
     """Settings from what `dataclasses.asdict` made of them. Raises GridSimError for names or types that do not fit."""
-    usual = vars(kind())
-    unknown = sorted(values.keys() - usual.keys())
-    if unknown:
-        raise GridSimError(f"unknown setting {unknown[0]!r}, perhaps of another version of GridSim; start a new run")
-    for name, value in values.items():
-        wanted = type(usual[name])
-        if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-            value = values[name] = float(value)
-        if type(value) is not wanted:
-            raise GridSimError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
-        choices = get_args(get_type_hints(kind)[name])
-        if choices and value not in choices:
-            raise GridSimError(f"setting {name!r} must be {' or '.join(choices)}, not {value!r}")
+    _check_types(kind, values)
     settings = kind(**values)
     settings.check()
     return settings
+
+
+def _check_types(kind: type[RunSettings], values: Mapping[str, Any]) -> None:
+    """Raises GridSimError for names or types of settings that do not fit."""
+    usual, hints = vars(kind()), get_type_hints(kind)
+    for name, value in values.items():
+        if name not in usual:
+            raise GridSimError(f"unknown setting {name!r}, perhaps of another version of GridSim; start a new run")
+        wanted, choices = type(usual[name]), get_args(hints[name])
+        if type(value) is not wanted and not (wanted is float and type(value) is int):
+            raise GridSimError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
+        if choices and value not in choices:
+            raise GridSimError(f"--{name.replace('_', '-')} must be {' or '.join(choices)}, not {value}")

@@ -16,7 +16,10 @@ RUNS = {
         ["--faults", "8", "--jobs", "2", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
-    "faults.py --workers 0": (["--faults", "6", "--jobs", "2", "--json"], {"faults", "champions", "processes_left", "disk_full"}),
+    "faults.py --workers 0": (
+        ["--faults", "6", "--jobs", "2", "--json"],
+        {"faults", "champions", "processes_left", "disk_full"},
+    ),
     "faults.py --cluster": (["--faults", "3", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
     "learners.py": (
         ["--quick", "--json"],

@@ -186,13 +186,14 @@ class Dqn(Learning):
     def state(self) -> State:
         arrays, meta = super().state()
         arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
-        arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
+        if not self.done() and not self.out_of_time():  # most of a checkpoint; a run that is extended fills a new one
+            arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
         return arrays, meta
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any], rows: np.ndarray) -> None:
         super().restore(arrays, meta, rows)
         self.learner.restore(named(arrays, "learner_"))
-        if "replay_added" in arrays:  # an ended run saves none; if it is extended, it fills a new one before it learns
+        if "replay_added" in arrays:
             self.replay.restore(named(arrays, "replay_"))
         self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]

@@ -59,8 +59,6 @@ class Evolution(Learning):
             raise ValueError(f"a fitness must return one number per member, [{len(results)}], not {score.shape}")
         return np.where(np.isfinite(score), score, -np.inf)
 
-    # ------------------------------------------------------------------------------------------------ a generation
-
     def step(self) -> Progress:
         """Evolve one generation."""
         curriculum, period = self.curriculum, self.sim.episode.control_period
@@ -127,8 +125,6 @@ class Evolution(Learning):
             and sum(latest) >= least * config.latest
             and self.validation_steps <= config.validation_share * self.car_steps
         )
-
-    # ------------------------------------------------------------------------------------------------------- state
 
     def counts(self) -> dict[str, int]:
         return {"generation": self.steps, "car_steps": self.car_steps}

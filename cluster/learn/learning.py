@@ -22,15 +22,7 @@ from cluster.learn.maps import Maps
 from cluster.settings import RunSettings
 from cluster.workers.pool import Call, Chunk, Outcome, WorkerPool
 from cluster.workers.worker import Task
-from evolution.episodes.curriculum import (
-    FINAL_SEEDS,
-    HELD_OUT_EPISODES,
-    HELD_OUT_SEEDS,
-    VALIDATION_SEEDS,
-    Curriculum,
-    spread_starts,
-    success_rate,
-)
+from evolution.episodes.curriculum import FINAL_SEEDS, VALIDATION_SEEDS, Curriculum, success_rate
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
@@ -38,7 +30,6 @@ from gridsim.config import SimConfig
 from gridsim.maps.scenarios import seed_of_map
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
-Names = tuple[tuple[str, int], ...]  # of maps, as pools know them
 
 WAIT_S = 0.2  # at most between two looks at progress
 
@@ -94,8 +85,6 @@ class Learning(ABC):
         self.spec = PolicySpec.parse(s.policy)
         self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, s.traffic)
 
-    # ------------------------------------------------------------------------------------------------------ the loop
-
     @abstractmethod
     def step(self) -> Progress:
         """Do one step and add its row to the history, without the wall clock's columns."""
@@ -149,8 +138,6 @@ class Learning(ABC):
             self.champion = Champion(candidate, score, float(success_rate(results)[0]), distance, step)
         self.solved = self.champion.score >= self.settings.until
 
-    # ------------------------------------------------------------------------------------------------- evaluating
-
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
         """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""
         warned, busy = 0, True
@@ -172,8 +159,8 @@ class Learning(ABC):
         self.car_steps += int(outcome.results["steps"].sum())
         return outcome
 
-    def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, Names, SimConfig]:
-        """The first fields of a task, which both kinds have."""
+    def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, tuple[tuple[str, int], ...], SimConfig]:
+        """The first fields of a task, which both kinds have; pools know maps by scenario and seed."""
         scenario = self.settings.scenario
         names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
         return self.settings.policy, episodes.rows, episodes.worlds, names, self.sim
@@ -190,12 +177,6 @@ class Learning(ABC):
         row, before = self.history[-1], self.history[-2] if self.steps > 1 else {"car_steps": 0.0, "wall_s": 0.0}
         steps, seconds = row["car_steps"] - before["car_steps"], wall_s - before["wall_s"]
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
-
-    def held_out_episodes(self) -> Episodes:
-        """Roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
-        return spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, self.settings.traffic)
-
-    # ------------------------------------------------------------------------------------------------------- state
 
     def state(self) -> State:
         """All that an exact resume needs besides the history, arrays and plain numbers."""
@@ -227,11 +208,11 @@ class Learning(ABC):
         return np.array(rows, dtype=np.float64).reshape(-1, len(self.columns))
 
 
-def finish(progress: Generator[Event, None, Any]) -> Any:
-    """Go through a step, or another part of a run, without showing its progress. Returns: what it returns."""
+def finish(progress: Generator[Event, None, Any], on_event: Callable[[Event], None] = lambda event: None) -> Any:
+    """Go through a step, or another part of a run, telling of its progress. Returns: what it returns."""
     try:
         while True:
-            next(progress)
+            on_event(next(progress))
     except StopIteration as end:
         return end.value
 

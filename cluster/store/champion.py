@@ -32,21 +32,13 @@ GONE = ("apart", "kerb")  # former parameters of traffic, which older champions 
 
 @dataclass(frozen=True)
 class Champion:
-    """A genome and what is needed to run it.
+    """A genome and what is needed to run it."""
 
-    Attributes:
-        genome: float32 [genes].
-        policy: its network, such as `mlp:6,7`.
-        scenario: where it learned.
-        sim: the simulator's parameters it learned with.
-        traffic: number of other cars it learned among.
-    """
-
-    genome: np.ndarray
-    policy: str
-    scenario: str
-    sim: SimConfig
-    traffic: int = 0
+    genome: np.ndarray  # float32 [genes]
+    policy: str  # its network, such as `mlp:6,7`
+    scenario: str  # where it learned
+    sim: SimConfig  # the simulator's parameters it learned with
+    traffic: int = 0  # other cars that it learned among
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
@@ -90,13 +82,8 @@ class Champion:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if it cannot be written."""
-        meta = {
-            "policy": self.policy,
-            "scenario": self.scenario,
-            "traffic": self.traffic,
-            "sim": dataclasses.asdict(self.sim),
-        }
-        checkpoint.save(path, {"genome": self.genome}, meta)
+        meta = {name: getattr(self, name) for name in ("policy", "scenario", "traffic")}
+        checkpoint.save(path, {"genome": self.genome}, meta | {"sim": dataclasses.asdict(self.sim)})
 
 
 class UnfinishedError(CheckpointError):
@@ -106,8 +93,7 @@ class UnfinishedError(CheckpointError):
 def load_champion(path: str | os.PathLike[str]) -> Champion:
     """Read a champion.npz, given the file or its run's folder.
 
-    Raises: UnfinishedError for a run that has no champion yet, CheckpointError for a file that is missing, damaged,
-    hostile or not a champion.
+    Raises: UnfinishedError for a run without one, CheckpointError for a file that is missing or not a champion.
     """
     path = Path(path)
     if os.path.isdir(path):  # path.is_dir() raises for a name that is too long

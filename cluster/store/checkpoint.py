@@ -41,11 +41,9 @@ class WriteError(CheckpointError):
 
 
 def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-    """Write `arrays` and `meta` to `path` in one step: afterwards the file is the new one or the old one, complete.
+    """Replace the file at `path` with `arrays` and `meta`, or leave it as it was and raise WriteError.
 
     The same content gives the same bytes. `meta` has to be plain JSON (string keys; tuples come back as lists).
-    Raises TypeError or ValueError for what the format cannot hold (objects) and WriteError if the file cannot be
-    written (a full disk, a folder that is gone).
     """
     text = json.dumps({"format": "gridsim", "version": VERSION, "meta": meta})
     buffer = io.BytesIO()
@@ -61,41 +59,32 @@ def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read what `save` wrote: the arrays (owned, aligned, writable, C order) and the meta data.
 
-    Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or not GridSim's.
+    Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited or not GridSim's.
     """
     path = Path(path)
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise CheckpointError(f"{path}: not a file")
     try:
         content = path.read_bytes()
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:  # the latter for a name with a null byte
         raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
-    if not content.startswith(b"PK\x03\x04"):
-        raise CheckpointError(f"{path}: {'not a GridSim file' if content else 'the file is empty'}")
     if content[-_DIGEST - len(_MARK) : -_DIGEST] != _MARK:
-        raise CheckpointError(f"{path}: truncated, or not written by GridSim")
+        raise CheckpointError(f"{path}: truncated, or not a GridSim file")
     if content[-_DIGEST:] != hashlib.sha256(memoryview(content)[:-_DIGEST]).hexdigest().encode():
         raise CheckpointError(f"{path}: damaged or edited: its content does not match its checksum")
     # A checksum is not a signature: another program may have written these bytes. zipfile, numpy and json raise a dozen
     # kinds of errors for such content, which all mean the same.
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            if sum(member.file_size for member in file.zip.infolist()) > len(content):
-                raise ValueError("its arrays are larger than the file")
             arrays = {name: file[name] for name in file.files}
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
             raise ValueError("it holds more than arrays")
         header = json.loads(arrays.pop("meta").tobytes().decode())
-        if header["format"] != "gridsim" or not isinstance(header["meta"], dict):
-            raise ValueError("it holds no GridSim data")
-        version, meta = header["version"], header["meta"]
+        if (header["format"], header["version"]) != ("gridsim", VERSION):
+            raise ValueError(f"its format is not {VERSION}, which this GridSim reads")
+        return arrays, dict(header["meta"])
     except Exception as error:
         raise CheckpointError(f"{path}: not a GridSim file ({one_line(error):.120})") from error
-    if version != VERSION:
-        raise CheckpointError(f"{path}: written in format {repr(version)[:20]}; this GridSim reads format {VERSION}")
-    return arrays, meta
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, durable: bool = True) -> None:
@@ -114,8 +103,12 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
                 os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        kept = "; the one before it is kept" if path.exists() else ""
-        raise WriteError(f"{path}: cannot be written: {one_line(error)}{kept}") from error
+        raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """`write_atomic` for a JSON file that people read, too."""
+    write_atomic(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -18,19 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from cluster.redaction import one_line
 from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store import checkpoint
-from cluster.store.checkpoint import (
-    CHAMPION,
-    CHECKPOINT,
-    CONFIG,
-    ELITES,
-    HISTORY,
-    MLFLOW,
-    STEPS,
-    SUMMARY,
-    CheckpointError,
-)
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, ELITES, HISTORY, MLFLOW, STEPS, SUMMARY
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
@@ -88,18 +79,16 @@ class RunFolder:
 
     def write_config(self) -> None:
         """Write config.json."""
-        checkpoint.write_atomic(self.path / CONFIG, (json.dumps(self.config(), indent=2) + "\n").encode())
+        checkpoint.write_json(self.path / CONFIG, self.config())
 
 
 def read_config(path: Path) -> tuple[RunSettings, str]:
     """Settings of either learner and the initial champion's path from a run's config.json. Raises RunError."""
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-        if config.get("format") in (1, 2):
+        config = json.loads(path.read_bytes())
+        if config["format"] != CONFIG_FORMAT:
             raise RunError(f"{path} is of an earlier GridSim, whose runs this one cannot continue; start a new run")
-        if config.get("format") != CONFIG_FORMAT:
-            raise RunError(f"{path}: not a {CONFIG} of this GridSim; start a new run")
-        settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
+        settings = from_dict(SETTINGS[config["command"]], config["settings"])
         if config.get("map_sha256", "") != _map_sha256(settings):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
         return settings, str(config.get("init", ""))
@@ -107,10 +96,8 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         raise
     except GridSimError as error:
         raise RunError(f"{path}: {error}") from error
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise RunError(f"{path}: not a run's {CONFIG}") from error
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise RunError(f"{path}: not a run's {CONFIG} ({one_line(error):.120})") from error
 
 
 def _map_sha256(settings: RunSettings) -> str:
@@ -122,18 +109,14 @@ def _map_sha256(settings: RunSettings) -> str:
     return map_digest(settings.scenario)
 
 
+@functools.cache  # so that a process may lock a folder again
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
-    _lock(path.resolve())
-
-
-@functools.cache  # so that a process may lock a folder again
-def _lock(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
         folder = os.open(path, os.O_RDONLY)
     except OSError as error:
-        raise RunError(f"{path} cannot be made: {error.strerror}; choose another --output") from error
+        raise RunError(f"--output: {path} cannot be made: {error.strerror}; choose another folder") from error
     with contextlib.suppress(OSError):  # NFS cannot lock folders
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -147,16 +130,16 @@ def open_run(folder: Path) -> RunFolder:
         raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
-    lock(folder)
-    settings, init = read_config(folder / CONFIG)
-    run = RunFolder(folder.resolve(), settings, init)
+    path = folder.resolve()
+    lock(path)
+    run = RunFolder(path, *read_config(folder / CONFIG))
     anew = f"start it anew with --config {as_argument(folder / CONFIG)}"
     if not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from; {anew}")
     try:
         run.saved = checkpoint.load(folder / CHECKPOINT)
-    except CheckpointError as error:
-        raise CheckpointError(f"{error}; {anew}") from error
+    except checkpoint.CheckpointError as error:
+        raise RunError(f"{error}; {anew}") from error
     meta = run.saved[1]
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
@@ -193,11 +176,6 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     if path.exists() and not (may_exist and path.is_dir() and {p.name for p in path.glob("[!.]*")} <= BEGUN):
         again = f"continue it with --resume {as_argument(path)}"
         raise RunError(f"{path} exists already; choose another --name, or {again}")
-    parent = output
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise RunError(f"--output {output}: cannot be written; choose another folder")
     return path.absolute()
 
 
@@ -208,4 +186,4 @@ def is_finished(run: RunFolder) -> bool:
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
     """Write summary.json, the mark of a finished run."""
-    checkpoint.write_atomic(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
+    checkpoint.write_json(folder / SUMMARY, summary)

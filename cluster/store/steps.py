@@ -1,13 +1,11 @@
 """The row of the history and the network of each step of a run, in one file that only grows.
 
-The checkpoint counts its records and holds their digest. Records are on the disk before the checkpoint that counts
-them; those that a kill leaves uncounted are overwritten when the run goes on. history.csv and elites.npz are written
-from them.
+The checkpoint counts its records, which are on the disk before it; those that a kill leaves uncounted are overwritten
+when the run goes on. history.csv and elites.npz are written from them.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,21 +27,16 @@ class Steps:
 
     def __init__(self, folder: Path, step_name: str, columns: Sequence[str], genes: int):
         self.number = 0  # steps that are on the disk
-        self._folder, self._head, self._record = folder, [step_name, *columns], _record(len(columns), genes)
-        self._sha256 = hashlib.sha256()
-
-    def meta(self) -> dict[str, Any]:
-        """What a checkpoint that counts these steps holds about them."""
-        return {"steps": self.number, "steps_sha256": self._sha256.hexdigest()}
+        self._folder, self._record = folder, _record(len(columns), genes)
+        self._history = [",".join([step_name, *columns])]  # lines of history.csv
 
     def resume(self, meta: Mapping[str, Any]) -> np.ndarray:
-        """Go on from the steps that a checkpoint with this `meta` counts. Returns: their rows, float64 [n, columns].
+        """Go on from the `steps` that a checkpoint's meta data counts. Returns: their rows, float64 [n, columns].
 
         Raises: CheckpointError.
         """
         records = _read(self._folder, meta, self._record)
         self.number = len(records)
-        self._sha256.update(records.tobytes())
         return records["row"]
 
     def append(self, rows: np.ndarray, elites: Sequence[np.ndarray]) -> None:
@@ -55,30 +48,20 @@ class Steps:
         new["row"], new["elite"] = rows, elites
         path = self._folder / STEPS
         try:
-            path.touch()
-            with open(path, "r+b") as file:
-                file.seek(self.number * new.itemsize)
+            with open(path, "ab") as file:
+                file.truncate(self.number * new.itemsize)
                 file.write(new.tobytes())
-                file.truncate()
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
         self.number += len(new)
-        self._sha256.update(new.tobytes())
 
-    def write_history(self, rows: Sequence[Sequence[float]], first: int) -> None:
-        """Write rows of history.csv from step number `first` on; with 0 the file is begun anew. Raises: WriteError."""
-        lines = [",".join([str(k), *map(repr, row)]) for k, row in enumerate(rows, first)]
-        path = self._folder / HISTORY
-        if not first:
-            checkpoint.write_atomic(path, "\n".join([",".join(self._head), *lines, ""]).encode(), durable=False)
-            return
-        try:
-            with open(path, "a", encoding="utf-8") as file:
-                file.write("".join(f"{line}\n" for line in lines))
-        except OSError as error:
-            raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
+    def write_history(self, rows: np.ndarray) -> None:
+        """Write history.csv with further rows, float64 [n, columns]. Raises: WriteError."""
+        for row in rows.tolist():
+            self._history.append(",".join([str(len(self._history) - 1), *map(repr, row)]))
+        checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode(), durable=False)
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:
@@ -103,12 +86,11 @@ def _record(columns: int, genes: int) -> np.dtype:
 
 def _read(folder: Path, meta: Mapping[str, Any], record: np.dtype) -> np.ndarray:
     """The records that a checkpoint with this `meta` counts. Raises: CheckpointError if the file lacks them."""
-    path = folder / STEPS
+    path, number = folder / STEPS, meta.get("steps", 0)
     try:
         with open(path, "rb") as file:
-            content = file.read(record.itemsize * meta.get("steps", 0))
+            return np.frombuffer(file.read(number * record.itemsize), record, number)
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
-    if hashlib.sha256(content).hexdigest() != meta.get("steps_sha256"):
-        raise CheckpointError(f"{path}: damaged or edited: it lacks steps that {CHECKPOINT} counts")
-    return np.frombuffer(content, record)
+    except ValueError as error:
+        raise CheckpointError(f"{path}: damaged or edited: it lacks steps that {CHECKPOINT} counts") from error

@@ -26,9 +26,10 @@ import torch
 from torch.optim.adam import adam
 
 from evolution.dqn.replay import Batch, Replay
-from evolution.networks.export import layers_of, outputs
-from evolution.networks.policy import PolicySpec, squash
+from evolution.networks.export import layers_of
+from evolution.networks.policy import KERNEL_1, KERNEL_2, STRIDE_1, STRIDE_2, CnnSpec, PolicySpec, squash
 from gridsim.jit import njit
+from gridsim.sensing.grid import CELLS
 
 T = TypeVar("T", np.ndarray, float)
 RANDOM_SHARE = 0.02  # of exploration's decline, over which it falls from random driving
@@ -134,7 +135,24 @@ class QNetwork:
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Values float32 [n, outputs] of the actions for inputs float32 [n, inputs]."""
-        return outputs(self.spec, self.layers, x, tanh)
+        if isinstance(self.spec, CnnSpec):
+            return self._convolutional(self.spec, x)
+        *hidden, (weights, biases) = self.layers
+        for layer_weights, layer_biases in hidden:
+            x = tanh(torch.addmm(layer_biases, x, layer_weights))
+        return torch.addmm(biases, x, weights)
+
+    def _convolutional(self, spec: CnnSpec, x: torch.Tensor) -> torch.Tensor:
+        one, two, _ = spec.hidden
+        (w1, b1), (w2, b2), (w3, b3), (w4, b4) = self.layers
+        frames, speed = x[:, :-1].reshape(-1, spec.frames, CELLS, CELLS), x[:, -1:]
+        # A genome orders a unit's inputs (frame, row, column), then (row, column, channel).
+        w1 = w1.view(spec.frames, KERNEL_1, KERNEL_1, one).permute(3, 0, 1, 2)
+        w2 = w2.view(KERNEL_2, KERNEL_2, one, two).permute(3, 2, 0, 1)
+        x = torch.relu(torch.nn.functional.conv2d(frames, w1, b1, stride=STRIDE_1))
+        x = torch.relu(torch.nn.functional.conv2d(x, w2, b2, stride=STRIDE_2))
+        x = torch.cat([x.permute(0, 2, 3, 1).flatten(1), speed], dim=1)
+        return torch.addmm(b4, torch.relu(torch.addmm(b3, x, w3)), w4)
 
 
 def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
@@ -162,6 +180,10 @@ class DqnLearner:
             torch.zeros(spec.size, device=self.device) for _ in range(4)
         )
         self._steps = torch.zeros((), device=self.device)
+        self._checkpointed = {  # each float32 [genes]
+            "weights": self.online.genome, "target": self.target.genome, "average": self._average,
+            "adam_mean": self._mean, "adam_variance": self._variance,
+        }  # fmt: skip
         self._key = int(np.random.SeedSequence([seed, _SAMPLES]).generate_state(1, np.uint64)[0])
         self.load_weights(new_weights(spec, seed))
 
@@ -237,24 +259,14 @@ class DqnLearner:
         with torch.no_grad():
             return self.online(self._tensor(observations)).cpu().numpy()
 
-    def _tensors(self) -> dict[str, torch.Tensor]:
-        """What a checkpoint holds, each float32 [genes]."""
-        return {
-            "weights": self.online.genome,
-            "target": self.target.genome,
-            "average": self._average,
-            "adam_mean": self._mean,
-            "adam_variance": self._variance,
-        }
-
     def state(self) -> dict[str, np.ndarray]:
         """The learner's state as copied arrays."""
-        arrays = {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
+        arrays = {name: tensor.cpu().numpy().copy() for name, tensor in self._checkpointed.items()}
         return arrays | {"updates": np.array(self.updates)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Restore a `state` of a learner with the same network."""
-        for name, tensor in self._tensors().items():
+        for name, tensor in self._checkpointed.items():
             tensor.copy_(torch.from_numpy(arrays[name].reshape(self.spec.size)))
         self.updates = int(arrays["updates"])
         self._steps.fill_(self.updates)

@@ -251,15 +251,10 @@ def _collect(
         run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, results[k])
 
 
-def _check(episodes: np.ndarray, worlds: np.ndarray) -> None:
-    """Raises: ValueError if the traffic's shape does not fit or a time limit is out of range."""
+def _check_steps(episodes: np.ndarray) -> None:
     wrong = episodes["steps"][(episodes["steps"] < 1) | (episodes["steps"] > MAX_STEPS)]
     if len(wrong):
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {wrong[0]}")
-    if not (episodes["target"] > 0.0).all():
-        raise ValueError("an episode needs a target above 0 m")
-    if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
-        raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
 
 
 def evaluate(
@@ -276,11 +271,11 @@ def evaluate(
     with, float32 [e, cars, TRAFFIC_FIELDS].
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
     start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
-    Raises: ValueError if shapes do not fit.
+    Raises: ValueError if the genomes do not fit or a time limit is out of range.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    _check(episodes, worlds)
+    _check_steps(episodes)
     buffers = policy_buffers(spec, config)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     # Transposed, because the kernel fills one episode at a time.
@@ -316,11 +311,9 @@ def collect(
     Args: as `evaluate`'s; weights float32 [spec.size]; each episode's share of random actions, float32 [e], and the
     seed of its random numbers, uint64 [e].
     Returns: (the experience, in the order of the episodes; RESULT [e]).
-    Raises: ValueError if the weights or worlds do not fit.
+    Raises: ValueError if a time limit is out of range.
     """
-    if weights.shape != (spec.size,):
-        raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")
-    _check(episodes, worlds)
+    _check_steps(episodes)
     buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config)
     weights = freeze(weights.astype(np.float32, copy=False))
     setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))

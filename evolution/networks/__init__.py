@@ -1,1 +1,1 @@
-"""Networks: policy specifications, flat genomes, forward passes, export to PyTorch."""
+"""Networks: policy specifications, flat genomes, forward passes, export to ONNX."""

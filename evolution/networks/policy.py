@@ -106,7 +106,6 @@ class MlpSpec(PolicySpec):
 
     @property
     def inputs(self) -> int:
-        """The rays, with `motion` their closing speeds, the speed, and with `steering` the steering angle."""
         return INPUTS + (RAYS if self.motion else 0) + self.steering
 
     @property
@@ -149,7 +148,6 @@ class CnnSpec(PolicySpec):
 
     @property
     def inputs(self) -> int:
-        """The cells of all frames, and the speed."""
         return self.frames * CELLS * CELLS + 1
 
     @property

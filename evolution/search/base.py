@@ -51,7 +51,7 @@ class Search(ABC):
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         self.spec, self.config, self.seed = spec, config, seed
         self.generation = 0  # completed generations
-        self.asked: Generation | None = None
+        self.asked: Generation  # the current generation
         self.champion: np.ndarray | None = None  # the run's, float32 [genes], for searches with it as an elite
 
     @abstractmethod
@@ -78,29 +78,17 @@ class Search(ABC):
     def _tell(self, asked: Generation, scores: np.ndarray) -> None: ...
 
     def ask(self) -> Generation:
-        """The next generation. Raises: RuntimeError if `tell` was not called for the last one."""
-        if self.asked is not None:
-            raise RuntimeError("ask() was called twice; tell() the scores first")
+        """The next generation."""
         self.asked = self._ask(int(self._rng(0).integers(1 << 63)))
         return self.asked
 
     def tell(self, scores: np.ndarray) -> None:
-        """Take the members' scores float64 [population], to be compared within groups; higher is better, NaN the worst.
-
-        Raises: RuntimeError if no generation was asked for; ValueError for a wrong number of scores.
-        """
-        if self.asked is None:
-            raise RuntimeError("tell() was called without ask()")
-        if scores.shape != (self.config.population,):
-            raise ValueError(f"there are {self.config.population} members, not {scores.shape} scores")
+        """Take the scores float64 [population], which are compared within groups; higher is better, NaN the worst."""
         self._tell(self.asked, np.where(np.isnan(scores), -np.inf, scores))
         self.generation += 1
-        self.asked = None
 
     def genomes(self, members: np.ndarray) -> np.ndarray:
         """Genomes float32 [k, genes] of members [k] of the current generation."""
-        if self.asked is None:
-            raise RuntimeError("no generation was asked for")
         asked = self.asked
         return breed(asked.parents, asked.recipes[members], asked.key, self.spec, asked.mutation)
 

@@ -83,17 +83,6 @@ def test_a_run_goes_on_exactly(loop, monkeypatch):
     np.testing.assert_equal(resumed.state(), straight.state())
 
 
-def test_large_values_can_be_saved_and_taken_up_again(loop):
-    learning = loop(learning_rate=1e30)
-    for _ in range(4):
-        step(learning)
-    assert learning.history[-1]["q/mean"] != 0.0
-    assert np.isfinite([list(row.values()) for row in learning.history]).all()
-    again = loop(learning_rate=1e30)
-    again.restore(*learning.state(), learning.table())
-    assert again.counts() == learning.counts()
-
-
 def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop):
     learning = loop()
     step(learning)

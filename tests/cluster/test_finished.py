@@ -30,8 +30,8 @@ def test_runs_are_compared_from_python(tmp_path):
     [
         ("summary.json", None, "not finished"),
         ("config.json", None, "not a run's folder"),
-        *(("summary.json", text, "damaged") for text in ("", "[" * 100_000, "[1]", "{}")),
-        *(("config.json", text, "not a config.json of this GridSim") for text in ('{"settings": []}', '{"format": 9}')),
+        *(("summary.json", text, "damaged") for text in ("", "{", "[" * 100_000, "[1]", "{}")),
+        *(("config.json", text, "config.json") for text in ("", '{"settings": []}', '{"format": 9}')),
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
         ("summary.json", {"car_steps": 10**400}, "damaged"),
         ("summary.json", {"held_out": {}}, "make it again with --resume"),
@@ -46,4 +46,11 @@ def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
     else:
         path.write_text(json.dumps(summary | content) if isinstance(content, dict) else content)
     with pytest.raises(GridSimError, match=rf"^[^\n]*({said})[^\n]*$"):
+        read_run(tmp_path / "a")
+
+
+def test_a_champion_that_is_damaged_is_told_as_its_errors_are_measured(tmp_path):
+    make_run(tmp_path / "a")
+    (tmp_path / "a/champion.npz").write_text("PK")
+    with pytest.raises(GridSimError, match=r"^[^\n]*not a GridSim file[^\n]*$"):
         measured(read_run(tmp_path / "a"))

@@ -25,11 +25,7 @@ def test_the_policy_suits_observation_and_traffic(policy, settings):
 
 
 def test_what_a_file_does_not_say_is_as_by_default():
-    """Of a run from before there were grids; and whole numbers may stand for others."""
-    values = asdict(EvolveSettings(policy="mlp:9"))
-    del values["observation"]
-    found = from_dict(EvolveSettings, values | {"sigma": 1})
-    assert (found.observation, found.sigma) == ("rays", 1.0)
+    assert from_dict(EvolveSettings, {"policy": "mlp:9", "sigma": 1}) == EvolveSettings(policy="mlp:9", sigma=1.0)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +34,7 @@ def test_what_a_file_does_not_say_is_as_by_default():
         ({"observation": "radar"}, "rays or grid"),
         ({"observation": 3}, "must be str"),
         ({"population": True}, "must be int"),
-        ({"recombination": "some"}, "'recombination' must be all or two"),
+        ({"recombination": "some"}, "--recombination must be all or two"),
         ({"crossover": 1}, "^unknown setting 'crossover', perhaps of another version of GridSim; start a new run$"),
     ],
 )
@@ -80,7 +76,6 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
 
 def test_the_search_s_parameters_are_the_settings():
     settings = EvolveSettings(recombination="two", population=64, tournament=3, sigma=0.7, elites=2, mutation_rate=0.1)
-    settings.check()
     assert settings.search_config() == SearchConfig(64, 4, 3, 0.7, 2, 0.1)
 
 
@@ -102,12 +97,11 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
         (EvolveSettings, {"tournament": 0}, "--tournament must be 1 to"),
         (EvolveSettings, {"sigma": float("nan")}, "--sigma must be above 0"),
         (DqnSettings, {"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
-        (DqnSettings, {"replay": 10}, r"--replay must be 256 \(a batch or more, .*\) to 10,000,000, not 10"),
-        (DqnSettings, {"batch": 1, "replay": 1}, r"--replay must be 2 \("),
-        (DqnSettings, {"observation": "grid", "policy": "cnn:8,8,8@4", "batch": 1, "replay": 4}, "--replay must be 5 "),
+        (DqnSettings, {"replay": 10}, "--replay must be 256 to 10,000,000, not 10"),
+        (DqnSettings, {"observation": "grid", "batch": 1, "replay": 4}, "--replay must be 5 to"),
         (EvolveSettings, {"observation": "pixels"}, "--observation must be rays or grid, not pixels"),
         (DqnSettings, {"policy": "cnn"}, "policy cnn sees the grid"),
-        (DqnSettings, {"device": "abacus"}, "--device must be auto, cpu or cuda, not abacus"),
+        (DqnSettings, {"device": "abacus"}, "--device must be auto or cpu or cuda, not abacus"),
         (DqnSettings, {"anneal": 10**400}, "--anneal must be 1 to 1,000,000,000,000,000"),
     ],
 )

@@ -213,7 +213,7 @@ def save_steps(run, elites):
     if (run / "checkpoint.npz").exists():
         saved.resume(checkpoint.load(run / "checkpoint.npz")[1])
     saved.append(np.zeros((len(elites), 2)), elites)
-    checkpoint.save(run / "checkpoint.npz", {}, {"columns": ["a", "b"], **saved.meta()})
+    checkpoint.save(run / "checkpoint.npz", {}, {"columns": ["a", "b"], "steps": saved.number})
 
 
 def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monkeypatch, capsys):

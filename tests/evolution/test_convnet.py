@@ -1,18 +1,17 @@
-"""Convolutional networks against PyTorch in float64."""
+"""Convolutional networks against PyTorch."""
 
 import math
 
 import numpy as np
 import pytest
+import torch
 from searching import new_genomes
 
+from evolution.dqn.learner import QNetwork
 from evolution.networks import convnet
-from evolution.networks.export import to_torch
-from evolution.networks.policy import CnnSpec
+from evolution.networks.policy import SPEED_SCALE, CnnSpec
 from gridsim.config import SimConfig
 from gridsim.sensing.grid import grid_table, grids
-
-torch = pytest.importorskip("torch")
 
 F = np.float32
 SPECS = [CnnSpec((8, 8, 8), 1), CnnSpec((8, 16, 32), 1), CnnSpec((16, 24, 40), 2), CnnSpec((24, 32, 64), 3), CnnSpec()]
@@ -28,8 +27,10 @@ def test_forward_is_pytorchs(spec):
         for frame in frames:
             convnet.push(frame.ravel(), False, room)
         convnet.forward(genome, spec.layers, speed, room)
-        seen = torch.from_numpy(np.append(frames, speed)[None].astype(float))
-        expected = to_torch(spec, genome, SimConfig()).double()(seen).numpy()[0]
+        seen = torch.from_numpy(np.append(frames / F(255.0), speed / SPEED_SCALE - 1)[None].astype(F))
+        network = QNetwork(spec, torch.device("cpu"))
+        network.genome.copy_(torch.from_numpy(genome))
+        expected = network(seen).numpy()[0].astype(float)
         assert np.abs(expected).max() > 1e-3
         assert room.outputs == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
         assert convnet.act_on(spec, genome, frames, float(speed)) == int(room.outputs.argmax())

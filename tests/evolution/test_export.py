@@ -1,4 +1,4 @@
-"""Champions outside GridSim, in ONNX and in PyTorch, against the kernels that drive them."""
+"""Champions outside GridSim, in ONNX, against the kernels that drive them."""
 
 import math
 import subprocess
@@ -8,10 +8,9 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-import torch
 
 from evolution.networks import convnet
-from evolution.networks.export import example, to_onnx, to_torch
+from evolution.networks.export import example, to_onnx
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on, outputs_of
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
 from gridsim.sensing.grid import CELLS, FREE
@@ -53,9 +52,6 @@ def test_perceptrons_give_the_kernels_outputs(text, config):
     assert (found.shape, found.dtype) == ((300, 8), F)
     np.testing.assert_allclose(found, expected, **close)
     np.testing.assert_allclose(run(to_onnx(spec, genome, config), observations[:1]), expected[:1], **close)
-    module = to_torch(spec, genome, config)
-    np.testing.assert_allclose(module(torch.from_numpy(observations)).numpy(), expected, **close)
-    assert not any(p.requires_grad for p in module.parameters())
     actions = np.asarray(act_on(spec, genome, observations, config))
     assert len(set(actions.tolist())) > 1
     assert (expected.argmax(axis=1) == actions).all()
@@ -76,8 +72,6 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
             convnet.push(frame, False, scratch)
         convnet.forward(genome, spec.layers, speeds[n], scratch)
         np.testing.assert_allclose(found[n], scratch.outputs, rtol=0.0, atol=1e-5 * np.abs(scratch.outputs).max())
-    theirs = to_torch(spec, genome, config)(torch.from_numpy(observations)).numpy()
-    np.testing.assert_allclose(found, theirs, rtol=0.0, atol=1e-5 * np.abs(theirs).max())
 
 
 @pytest.mark.parametrize("text", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
@@ -103,8 +97,6 @@ def test_the_same_genome_gives_the_same_file_in_any_process_without_torch(text, 
 
 @pytest.mark.parametrize("genome", [np.zeros(312, dtype=F), np.zeros(311), np.zeros((1, 311), dtype=F)])
 def test_another_genome_is_refused(genome):
-    with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
-        to_torch(PolicySpec.parse("mlp:6,7"), genome, SimConfig())
     with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
         to_onnx(PolicySpec.parse("mlp:6,7"), genome, SimConfig())
 

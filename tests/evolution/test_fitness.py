@@ -51,11 +51,3 @@ def test_what_metres_are_worth():
     assert unpaced == pytest.approx(paced)
     whole, enough, less = worth((400, 400), (400, 320), (400, 310))  # a fifth may be outside the interval
     assert whole == enough > less
-
-
-def test_each_episode_may_have_its_own_target():
-    drives = np.array([[100.0, 100.0]])
-    value = scalar(results(drives, drives), np.array([100.0, 400.0]))
-    alone = [scalar(results([[100.0]], [[100.0]]), t)[0] for t in (100.0, 400.0)]
-    assert value[0] == pytest.approx(np.mean(alone))
-    assert alone[0] == pytest.approx(1.0)

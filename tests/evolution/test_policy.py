@@ -116,16 +116,6 @@ def test_cnn_alone_is_the_papers_network():
     assert (spec.observation, PolicySpec.parse("mlp:6,7").observation) == ("grid", "rays")
 
 
-@given(hidden=st.tuples(*[st.integers(1, 4)] * 3), frames=st.integers(1, 8))
-def test_cnn_text_and_back(hidden, frames):
-    units = [8 * n for n in hidden]
-    text = "cnn:" + ",".join(map(str, units)) + f"@{frames}"
-    spec = PolicySpec.parse(text)
-    assert str(spec) == text
-    assert spec.layers.tolist() == [frames, *units, 8]
-    assert spec.inputs == frames * 80 * 80 + 1
-
-
 def test_genes_are_as_large_as_he_et_al_have_them():
     """sqrt(2 / inputs) in hidden layers, sqrt(1 / inputs) in the last one, and 1 for the speed's weights."""
     genes, inputs = [65 * 8, 129 * 16, 1024 * 32, 32, 32, 33 * 8], [64, 128, 1024, 2, 1024, 64]

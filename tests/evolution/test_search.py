@@ -65,22 +65,6 @@ def test_pairs_stay_together_in_groups_of_about_as_many(data):
     assert np.ptp((sizes + 1) // 2) <= 1
 
 
-def test_out_of_order_raises():
-    search = Recombination(SPEC, SearchConfig(population=40, groups=2), seed=9)
-    with pytest.raises(RuntimeError, match="without ask"):
-        search.tell(np.zeros(40))
-    with pytest.raises(RuntimeError, match="asked for"):
-        search.genomes(np.arange(40))
-    search.ask()
-    with pytest.raises(RuntimeError, match="twice"):
-        search.ask()
-    for wrong in (np.zeros(39), np.zeros((40, 1)), np.zeros(0)):
-        with pytest.raises(ValueError, match="40 members"):
-            search.tell(wrong)
-    search.tell(np.zeros(40))  # what was refused has changed nothing
-    assert search.generation == 1
-
-
 @pytest.mark.parametrize("kind", SEARCHES)
 def test_the_first_generation_is_new_and_each_has_a_key_of_its_own(kind):
     search, other = (kind(SPEC, SearchConfig(population=41, groups=3), seed) for seed in (4, 5))

@@ -63,14 +63,3 @@ def test_a_search_that_starts_from_a_genome_breeds_from_it(elites):
     search.start_from(genome)
     search.ask()
     assert (search.genomes(EVERYONE) == genome).all()
-
-
-def test_who_has_no_score_is_neither_elite_nor_parent():
-    """Not even where all of its group is spoilt, and so equal."""
-    search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=20, elites=25), seed=3)
-    search.ask()
-    members = search.genomes(EVERYONE)
-    scores = first_gene(members)
-    scores[:5], scores[5:10] = np.nan, -np.inf
-    search.tell(scores)
-    assert not {m.tobytes() for m in members[:10]} & {p.tobytes() for p in search.parents}
