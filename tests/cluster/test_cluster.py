@@ -24,7 +24,7 @@ from packaging.requirements import Requirement
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
 from cluster.compare.plan import Plan
-from cluster.workers.ray_session import PACKAGES, runtime_env
+from cluster.workers.ray_session import PACKAGES
 from gridsim import evolve
 from gridsim.jit import CACHE_FOLDER
 
@@ -123,18 +123,6 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
 def test_the_guide_names_the_files_that_there_are(root: Path) -> None:
     guide = (root / "docs" / "cluster.md").read_text(encoding="utf-8")
     assert set(re.findall(r"cluster/(\w+)\.yaml", guide)) == {*LAUNCHED, "kuberay"}
-
-
-def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = runtime_env("/empty")
-    assert alone["working_dir"] == "/empty", "Ray would put the working folder of the command on its workers' path"
-    assert [Path(folder).name for folder in alone["py_modules"]] == ["cluster", "evolution", "gridsim"]
-    for submitted in (None, {"working_dir": "gcs://w.zip"}, {"py_modules": ["gcs://mine.zip"]}):
-        monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted}))
-        wanted = {**alone, "py_modules": [*alone["py_modules"], *(submitted or {}).get("py_modules", [])]}
-        if "working_dir" in (submitted or {}):
-            del wanted["working_dir"]
-        assert runtime_env("/empty") == wanted
 
 
 RAY = BIN / "ray"

@@ -17,10 +17,11 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 from commands import finish, wait_until
 from driving import to_bytes
-from test_pool import Answering, collect_drive_task, drive_task, make_collect_task, make_recipes, make_task, never_built
+from test_pool import Answering, drive_task, make_collect_task, make_recipes, make_task, never_built
 
 from cluster.workers import address, ray_pool
-from cluster.workers.pool import Call, Outcome, PoolError
+from cluster.workers.open import open_pool
+from cluster.workers.pool import Call, Collected, Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.threads import ThreadPool
 from cluster.workers.worker import CollectTask, Worker
@@ -35,8 +36,8 @@ class Obeying(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def answer(self, task, maps, recipes, first, stop):
-        rows = task.keys[first:stop] if isinstance(task, CollectTask) else recipes["seed"]
+    def answer(self, task, maps, recipes, columns):
+        rows = task.keys[columns] if isinstance(task, CollectTask) else recipes["seed"]
         for path in sorted(self._folder.glob("*-*")):
             what, row = path.name.split("-")
             times = int(path.read_text())
@@ -44,10 +45,8 @@ class Obeying(Answering):
                 mine = self._folder / str(os.getpid())
                 mine.write_text(str(times - 1))
                 mine.replace(path)  # at once: another worker may read it just now
-                if what == "raise":
-                    raise ValueError("that member\nis not to be had")
                 os.kill(os.getpid(), signal.SIGKILL if what == "kill" else signal.SIGSTOP)
-        return super().answer(task, maps, recipes, first, stop)
+        return super().answer(task, maps, recipes, columns)
 
 
 class Inspecting(Worker):
@@ -84,9 +83,8 @@ def pool(held: list[RayPool], folder: Path) -> RayPool:
     for path in folder.iterdir():
         path.unlink()
     if not held:
-        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)))
-        held[0].open()
-    wait_until(lambda: held[0].evaluate(make_task(), make_recipes(512)) and len(held[0].pids()) == 2)
+        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)).open())
+    wait_until(lambda: held[0].run(Outcome(make_task(), make_recipes(512))) and len(held[0].pids()) == 2)
     return held[0]
 
 
@@ -97,51 +95,39 @@ def no_pool(held: list[RayPool]) -> None:
         held.pop().close()
 
 
-def expected(n: int) -> bytes:
-    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as pool:
-        return pool.evaluate(make_task(), make_recipes(n)).results.tobytes()
-
-
-def test_what_is_sent_is_counted(pool: RayPool) -> None:
-    outcome = pool.evaluate(make_task(), make_recipes(512))
-    assert outcome.bytes_down == outcome.recipes.nbytes
-    assert outcome.results.nbytes < outcome.bytes_up < outcome.results.nbytes + 20_000
-    assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
-    assert set(outcome.busy_s) == {0, 1}
+def goes_on(pool: RayPool) -> bool:
+    """Whether a pool can be used again, with the results of threads."""
+    outcome = Outcome(make_task(), make_recipes(512))
+    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
+        wanted = threads.run(Outcome(make_task(), make_recipes(512)))
+    return pool.run(outcome).results.tobytes() == wanted.results.tobytes()
 
 
 @pytest.mark.parametrize("what", ["kill", "stop"])
-@pytest.mark.parametrize("calls", ["evaluate", "collect"])
+@pytest.mark.parametrize("kind", [Outcome, Collected])
 def test_what_a_lost_worker_held_is_done_by_another(
-    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str, calls: str
+    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str, kind: type[Call]
 ) -> None:
     """One that is killed, or that is stopped, as by a host that is cut off, of which Ray says nothing."""
     monkeypatch.setattr(pool, "_silence_s", 2.0)
-    before, pid = set(pool.pids()), 0
+    asked = (make_task(), make_recipes(512)) if kind is Outcome else (make_collect_task(400),)
+    before = set(pool.pids())
     (folder / f"{what}-30").write_text("1")
-    if calls == "evaluate":
-        call: Call = (driven := pool.evaluate(make_task(), make_recipes(512)))
-        assert driven.results.tobytes() == expected(512)
-    else:
-        call = collected = pool.collect(make_collect_task(400))
-        with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
-            assert to_bytes(collected.experience) == to_bytes(threads.collect(make_collect_task(400)).experience)
+    call = pool.run(kind(*asked))
+    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
+        wanted = threads.run(kind(*asked))
+    assert call.results.tobytes() == wanted.results.tobytes()
+    if isinstance(call, Collected) and isinstance(wanted, Collected):
+        assert to_bytes(call.experience) == to_bytes(wanted.experience)
     (said,) = call.warnings
     reason = KILLED if what == "kill" else r"it did not answer for \d+ s \(--patience\)"
     assert re.fullmatch(f"a worker is replaced: {reason}", said)
-    assert 1 <= call.retries <= ray_pool.QUEUED
-    wait_until(lambda: pool.evaluate(make_task(), make_recipes(64)) and len(pool.pids()) == 2)
+    wait_until(lambda: goes_on(pool) and len(pool.pids()) == 2)
     (pid,) = before - set(pool.pids())
     wait_until(lambda: not psutil.pid_exists(pid), 30)
-
-
-def test_a_worker_that_had_nothing_to_do_for_longer_than_patience_is_kept(
-    pool: RayPool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pool, "_silence_s", 1.0)
     pids = pool.pids()
-    time.sleep(1.5)
-    assert pool.evaluate(make_task(), make_recipes(512)).warnings == []
+    time.sleep(2.5)
+    assert pool.run(Outcome(make_task(), make_recipes(512))).warnings == [], "it only had nothing to do"
     assert pool.pids() == pids
 
 
@@ -152,26 +138,18 @@ def test_three_deaths_over_one_piece_end_the_run_in_one_line(pool: RayPool, fold
         rf"0x3039\)\); the last time {KILLED}"
     )
     with pytest.raises(PoolError) as caught:
-        pool.evaluate(make_task(), make_recipes(512))
+        pool.run(Outcome(make_task(), make_recipes(512)))
     found = re.fullmatch(line, str(caught.value))
     assert found, caught.value
     assert int(found[1]) <= 300 <= int(found[2])
     assert (folder / "kill-300").read_text() == "6"
     (folder / "kill-300").unlink()
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
-
-
-def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path) -> None:
-    (folder / "raise-100").write_text("9")
-    with pytest.raises(PoolError, match=r"^a worker failed on members \d+ to \d+: ValueError: is not to be had\Z"):
-        pool.evaluate(make_task(), make_recipes(512))
-    (folder / "raise-100").unlink()
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+    assert goes_on(pool)
 
 
 def test_answers_to_a_call_that_was_left_do_not_count_for_the_next(pool: RayPool) -> None:
     pool.start(Outcome(make_task(), make_recipes(512)[::-1]))
-    assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+    assert goes_on(pool)
 
 
 def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,39 +161,22 @@ def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(ray, "wait", fail)
         with pytest.raises(PoolError, match=r"^Ray failed: .*is gone$"):
-            pool.evaluate(make_task(), make_recipes(512))
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+            pool.run(Outcome(make_task(), make_recipes(512)))
+    assert goes_on(pool)
 
 
-def test_only_one_pool_at_a_time(pool: RayPool) -> None:
-    second = RayPool(1, never_built)
-    with contextlib.closing(pool), pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or .*\(workers=0\)$"):
-        second.open()
-
-
-def test_maps_that_are_not_used_are_forgotten_where_there_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_pool, "MOST_MAPS", 3)
-    maps = dict.fromkeys([("city", seed) for seed in range(4)])
-    for _ in range(2):
-        ray_pool.bounded(maps, [("city", 1), ("city", 3)])
-        assert list(maps) == [("city", 1), ("city", 3)]
-        ray_pool.bounded(maps, [("city", 7)])  # two are not many
+def test_a_ray_that_is_in_use_is_left_alone(pool: RayPool) -> None:
+    with pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or .*\(workers=0\)$"):
+        open_pool(1, None, 0.0, never_built)
+    assert goes_on(pool)
 
 
 @pytest.mark.usefixtures("no_pool")
 def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
-    (task, maps), recipes, collecting = drive_task(), make_recipes(200), collect_drive_task(100)
+    (task, maps), recipes = drive_task(), make_recipes(200)
     with contextlib.closing(RayPool(2, lambda _, seed: maps[seed], worker_factory=Inspecting)) as pool:
-        pool.open()
-        first = pool.evaluate(task, recipes)
+        first = pool.open().run(Outcome(task, recipes))
         assert first.results.tobytes() == Worker().evaluate(task, maps, recipes)[0].tobytes()
-        assert first.broadcast_bytes > sum(each.nbytes for each in maps)
-        killer = threading.Timer(0.001, os.kill, (pool.pids()[-1], signal.SIGKILL))
-        killer.start()
-        for _ in range(2):
-            wanted, _ = Worker().collect(collecting, maps)
-            assert to_bytes(pool.collect(collecting).experience) == to_bytes(wanted)
-        killer.join()
         processes = psutil.Process().children(recursive=True)
     assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
 
@@ -223,11 +184,8 @@ def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
 @pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_pool, "MAX_DEATHS", 3)
-    with (
-        contextlib.closing(RayPool(1, never_built, worker_factory=Obeying)) as pool,  # type: ignore[arg-type]
-        pytest.raises(PoolError, match=r"^workers keep dying \(4 in a row\); the last time TypeError: .*'folder'$"),
-    ):
-        pool.open()
+    with pytest.raises(PoolError, match=r"^workers keep dying \(4 in a row\); the last time TypeError: .*'folder'$"):
+        RayPool(1, never_built, worker_factory=Obeying).open()  # type: ignore[arg-type]
 
 
 # --- Clusters, which are joined by processes of their own: Ray reads a token once -------------------------------------
@@ -235,14 +193,14 @@ def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.M
 JOIN = """
 import sys, time
 from test_pool import make_recipes, make_task, never_built, Answering
-from cluster.workers.pool import PoolError
+from cluster.workers.pool import Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 
 for address in sys.argv[3:]:
     pool = RayPool(int(sys.argv[1]), never_built, address, float(sys.argv[2]), Answering)
     try:
         pool.open()
-        print(pool.workers, pool.evaluate(make_task(), make_recipes(8)).done)
+        print(pool.workers, pool.run(Outcome(make_task(), make_recipes(8))).done)
     except PoolError as error:
         print(error)
     pool.close()
