@@ -22,4 +22,10 @@ def open_pool(workers: int, address: str | None, patience_s: float, build_map: B
         return ThreadPool(build_map)
     from cluster.workers.ray_pool import RayPool  # here, because it imports Ray
 
-    return RayPool(workers, build_map, address, patience_s).open()
+    pool = RayPool(workers, build_map, address, patience_s)
+    try:
+        pool.open()
+    except BaseException:
+        pool.close()
+        raise
+    return pool

@@ -74,7 +74,7 @@ class Call(ABC):
 
     @abstractmethod
     def identify(self, piece: Chunk) -> str:
-        """A piece's first member with its recipe, or episode of experience, so that it can be tried again."""
+        """A piece in words, and its first member's recipe, or episode of experience, so that it can be tried again."""
 
 
 class Outcome(Call):
@@ -104,7 +104,8 @@ class Outcome(Call):
         recipe = self.recipes[row]
         kind = Kind(int(recipe["kind"])).name.lower()
         parents = f"rows {recipe['a']} and {recipe['b']}"
-        return f"member {row} ({kind} of {parents}, seed {recipe['seed']}, key {self.task.key:#x})"
+        first = f"member {row} ({kind} of {parents}, seed {recipe['seed']}, key {self.task.key:#x})"
+        return f"{self.span(piece)} (first: {first})"
 
 
 class Collected(Call):
@@ -127,8 +128,9 @@ class Collected(Call):
         self._count(worker, piece, results, seconds)
 
     def identify(self, piece: Chunk) -> str:
-        episode = piece.columns.start
-        return f"episode {episode} (key {self.task.keys[episode]:#x}, exploration {self.task.epsilons[episode]:.3g})"
+        e, task = piece.columns.start, self.task
+        first = f"episode {e} (key {task.keys[e]:#x}, exploration {task.epsilons[e]:.3g})"
+        return f"{self.span(piece)} (first: {first})"
 
 
 AnyCall = TypeVar("AnyCall", bound=Call)

@@ -25,8 +25,6 @@ from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-Name = tuple[str, int]  # a map's scenario and seed
-
 PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a worker on this machine, and on a cluster, which may be growing
 MAX_KILLS = 3  # workers that a piece may cost
 MAX_DEATHS = 8  # of workers in a row, without an answer in between; three times as many as there are, if that is more
@@ -42,17 +40,14 @@ class Actor:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the coordinator ends its workers
         self._worker, self._shared = factory(), list[Any]()
         self._task: AnyTask
-        self._maps: dict[Name, Map] = {}
+        self._maps: dict[tuple[str, int], Map] = {}  # by scenario and seed
 
     def ready(self) -> int:
         """The process's id."""
         return os.getpid()
 
     def run(self, shared: list[Any], recipes: bytes, columns: slice) -> bytes:
-        """What `Worker.answer` returns for a piece of a task, pickled: Ray is slower with arrays than with bytes.
-
-        Args: `shared` holds a reference to the task and to its maps' references. The actor gets what it lacks.
-        """
+        """What `Worker.answer` returns for a piece of the task that `shared` refers to; Ray is slower with arrays."""
         if shared != self._shared:
             import ray
 
@@ -95,24 +90,19 @@ class RayPool(WorkerPool):
         self._session = Session()
         self._ray: Any = None  # once it is joined
         self._workers: list[_Worker] = []  # one that dies is replaced
-        self._shared = list[Any]()  # a reference to the latest task
-        self._maps: dict[Name, Any] = {}  # references to maps in Ray's store
+        self._shared = list[Any]()  # a reference to the latest task and to its maps' references
+        self._maps: dict[tuple[str, int], Any] = {}  # references to maps in Ray's store
         self._pieces: deque[_Piece] = deque()  # to be sent
         self._deaths = 0  # of workers since the latest answer
 
-    def open(self) -> RayPool:
+    def open(self) -> None:
         """Start Ray or join it, and wait for a first worker; others join as they come up. Raises PoolError."""
-        try:
-            self._ray = ray = self._session.open(self.workers, self._address, self._patience_s)
-            self.workers = self.workers or max(int(ray.available_resources().get("CPU", 0)), 1)
-            self._workers = [self._begin() for _ in range(self.workers)]
-            while not self.pids():
-                stopping.check()
-                self._take_in(LOOK_S)
-        except BaseException:
-            self.close()
-            raise
-        return self
+        self._ray = ray = self._session.open(self.workers, self._address, self._patience_s)
+        self.workers = self.workers or max(int(ray.available_resources().get("CPU", 0)), 1)
+        self._workers = [self._begin() for _ in range(self.workers)]
+        while not self.pids():
+            stopping.check()
+            self._take_in(LOOK_S)
 
     def pids(self) -> list[int]:
         """Process ids of the workers that are up, on whichever machine they are."""
@@ -124,33 +114,29 @@ class RayPool(WorkerPool):
 
     def _start(self, call: Call) -> None:
         self._session.check()
-        names = dict.fromkeys(call.task.maps)
-        for name in [name for name in names if name not in self._maps]:
-            self._maps[name] = self._ray.put(self._build_map(*name))
-        self._shared = [self._ray.put((call.task, {name: self._maps[name] for name in names}))]
+        for name in call.task.maps:
+            self._maps[name] = self._maps.get(name) or self._ray.put(self._build_map(*name))
+        self._shared = [self._ray.put((call.task, {name: self._maps[name] for name in call.task.maps}))]
         least_m = max(LEAST_M, MANY_M * self.workers)
         self._pieces = deque(_Piece(call, chunk) for chunk in cut(call, self.workers, least_m, max(least_m, MOST_M)))
         self._give()
 
     def _take_in(self, timeout_s: float) -> None:
+        """Take in what has come, replace silent workers, and send what is still to be done."""
+        self._session.check()
         try:
-            self._session.check()
             waiting = {worker.sent[0][0]: worker for worker in self._workers if worker.sent}
             if self._ray.wait(list(waiting), timeout=timeout_s)[0]:
                 for reference in self._ray.wait(list(waiting), num_returns=len(waiting), timeout=0)[0]:
                     self._receive(waiting[reference])
-            self._replace_silent()
+            for worker in list(self._workers):
+                silent_s = time.monotonic() - worker.heard if worker.pid and worker.sent else 0.0
+                if silent_s > self._silence_s:
+                    self._replace(worker, f"it did not answer for {silent_s:.0f} s (--patience)")
             self._give()
         except self._ray.exceptions.RayError as error:
             raise PoolError(f"Ray failed: {reason(error)}") from error
-
-    def _replace_silent(self) -> None:
-        """Replace workers that do not answer. Raises PoolError if there has been none for long."""
-        now = time.monotonic()
-        for worker in [worker for worker in self._workers if worker.pid and worker.sent]:
-            if now - worker.heard > self._silence_s:
-                self._replace(worker, f"it did not answer for {now - worker.heard:.0f} s (--patience)")
-        if not self.pids() and now - max(worker.heard for worker in self._workers) > self._patience_s:
+        if not self.pids() and time.monotonic() - max(worker.heard for worker in self._workers) > self._patience_s:
             total, free = self._ray.cluster_resources().get("CPU", 0), self._ray.available_resources().get("CPU", 0)
             why = f"Ray has {total:g} CPUs, {free:g} of them free, and a worker needs 1"
             raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
@@ -174,7 +160,6 @@ class RayPool(WorkerPool):
             if isinstance(cause, errors.RayError):  # it is dead, or lacks what it needs
                 return self._replace(worker, reason(cause))
             if piece and piece.call is self._call:
-                worker.sent.popleft()
                 raise PoolError(f"a worker failed on {piece.call.span(piece.chunk)}: {last_line(cause)}") from error
         worker.sent.popleft()
         worker.heard, self._deaths = time.monotonic(), 0
@@ -195,8 +180,9 @@ class RayPool(WorkerPool):
         if at_it and at_it.call is self._call:
             at_it.kills += 1
             if at_it.kills == MAX_KILLS:
-                what, first = at_it.call.span(at_it.chunk), at_it.call.identify(at_it.chunk)
-                raise PoolError(f"{MAX_KILLS} workers died over {what} (first: {first}); the last time {why}")
+                raise PoolError(
+                    f"{MAX_KILLS} workers died over {at_it.call.identify(at_it.chunk)}; the last time {why}"
+                )
         if self._deaths > max(MAX_DEATHS, MAX_KILLS * self.workers):
             raise PoolError(f"workers keep dying ({self._deaths} in a row); the last time {why}")
 

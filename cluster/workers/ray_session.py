@@ -16,15 +16,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cluster
-import evolution
-import gridsim
 from cluster import stopping
 from cluster.workers.child import Child
-from cluster.workers.pool import LOOK_S, PoolError
+from cluster.workers.pool import LOOK_S, PoolError, last_line
 from gridsim.jit import CACHE_FOLDER
 
-PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
+PACKAGES = ("cluster", "evolution", "gridsim")  # that are sent to a cluster's workers
 ENVIRONMENT = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
@@ -63,22 +60,13 @@ _has_token = False  # whether Ray, which reads its variables when it is imported
 
 
 class Session:
-    """This process's connection to Ray.
+    """This process's connection to a cluster, or to a Ray of our own: `ray start`, its files in a private folder."""
 
-    A Ray of our own is `ray start`, its files in a private folder, as /tmp/ray is open to all users of a machine.
-    """
-
-    def __init__(self) -> None:
-        self._folder = ""
-        self._head: Child | None = None
-        self._joined = False  # or on the way to it
+    _folder, _joined = "", False
+    _head: Child | None = None
 
     def open(self, cpus: int, address: str | None, patience_s: float) -> Any:
-        """Join a cluster, or start a Ray of our own with so many CPUs. Returns: the module `ray`. Raises PoolError.
-
-        To be called before there are threads: one that reads the environment while variables are set would crash. They
-        are not left behind, as other programs would use our token.
-        """
+        """Join a cluster, or start a Ray of our own with so many CPUs. Returns the module `ray`. Raises PoolError."""
         global _has_token
         ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
         if getattr(ray, "is_initialized", bool)():
@@ -88,17 +76,18 @@ class Session:
         _has_token = _has_token or address is None
         wanted = ENVIRONMENT | (OWN_ENVIRONMENT if address is None else CLUSTER_ENVIRONMENT)
         new = wanted.keys() - os.environ.keys()
-        os.environ.update({name: wanted[name] for name in new})
+        os.environ.update({name: wanted[name] for name in new})  # a thread that reads it just now would crash
         try:
             return self._join(address or self._start(cpus, patience_s))
         finally:
-            for name in new:
+            for name in new:  # other programs would use our token
                 os.environ.pop(name, None)
 
     def _start(self, cpus: int, patience_s: float) -> str:
         """Start a Ray of our own, wait until it is up, and return its address. Raises PoolError."""
         base, cure = os.environ.get("RAY_TMPDIR") or "/tmp", "set RAY_TMPDIR to a folder with room and a short path"
         try:
+            # Ray's own choice, /tmp/ray, is open to all users of a machine.
             self._folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))
         except OSError as error:
             raise PoolError(f"Ray cannot be started: {base}: {error.strerror}; {cure}") from None
@@ -128,12 +117,11 @@ class Session:
         """Connect to the Ray at an address, whose workers are sent our packages, and so run these sources."""
         import ray
 
-        logging.getLogger("ray").setLevel(logging.CRITICAL)
         terminal, self._joined = os.dup(2), True
         # In a thread Ray leaves the handlers of signals alone. Without a `working_dir` it puts this process's working
         # folder first on its workers' path, where a user's `evolution.py` would be found in place of our package.
         with tempfile.TemporaryDirectory() as empty, open(os.devnull, "w") as nowhere, ThreadPoolExecutor(1) as thread:
-            modules = [str(package.__path__[0]) for package in PACKAGES]
+            modules = [str(Path(__file__).parents[2] / package) for package in PACKAGES]
             sent = {"py_modules": modules, "excludes": ["__pycache__"], "working_dir": empty}
             quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
             os.dup2(nowhere.fileno(), 2)  # what it prints while it waits for an answer
@@ -168,5 +156,4 @@ class Session:
 def reason(error: BaseException) -> str:
     """What one of Ray's long messages means, in one line."""
     text = f"{type(error).__name__}: {error} {error.__cause__}"
-    last = (str(error) or type(error).__name__).strip().rpartition("\n")[2].strip()[:300]
-    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last)
+    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last_line(error)[:300])

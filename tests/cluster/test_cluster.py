@@ -65,7 +65,7 @@ def test_file_gives_each_machine_the_project_and_the_token(root: Path, name: str
     config = read(root, name)
     mounts = config["file_mounts"]
     assert mounts.pop("~/.ray/auth_token") == "~/.ray/auth_token"
-    assert {package.__name__ for package in PACKAGES} < set(mounts.values())
+    assert set(PACKAGES) < set(mounts.values())
     assert [path for path in mounts.values() if not (root / path).exists()] == []
     assert {there.removeprefix("~/gridsim/") for there in mounts} == set(mounts.values())
     for which in ("head", "worker"):
@@ -196,11 +196,16 @@ def test_the_same_run_as_a_job(up: Machines) -> None:
         pytest.skip("needs pip install 'ray[default]'")
     found = up.worker.start(RAY.with_name("python"), "-c", "import gridsim.config")
     assert "No module named 'gridsim.config'" in found.finish(60, code=1), "it has no GridSim"
+    (up.laptop.folder / "tmp/mine").mkdir()
+    (up.laptop.folder / "tmp/mine/helper.py").touch()
+    brought = json.dumps({"py_modules": ["/tmp/mine"]})  # which the run's own stand in place of
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
     try:
         wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
-        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "gridsim-evolve", "--workers", 2]
-        run = up.laptop.start(RAY, *job, "--name", "j", *SMALL, RAY_AUTH_MODE="token")
+        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--runtime-env-json", brought]
+        run = up.laptop.start(
+            RAY, *job, "--", "gridsim-evolve", "--workers", 2, "--name", "j", *SMALL, RAY_AUTH_MODE="token"
+        )
         there = wait_until(lambda: drives(up.worker.pid) or (run.process.poll() is not None and "over"), UP_S)
         run.finish(UP_S)
     finally:

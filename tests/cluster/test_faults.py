@@ -74,7 +74,6 @@ sys.addaudithook(hook)
     [
         "gridsim-evolve --scenario curved --generations 2",
         "gridsim-dqn --scenario curved --car-steps 2000",
-        "gridsim-compare --scenarios curved --learners evolution --seeds 2 --budget 20k --name c",
         "gridsim-compare --scenarios curved --learners evolution --seeds 2 --budget 20k --name c --jobs 2",
     ],
 )

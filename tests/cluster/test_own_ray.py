@@ -16,6 +16,7 @@ import tracked
 from commands import BIN, command_line, descendants, finish, ray_workers, rows, running, same_run, wait_until
 from test_pool import Answering, never_built
 
+from cluster.workers.open import open_pool
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.ray_session import OWN_ENVIRONMENT
@@ -37,7 +38,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 @pytest.mark.usefixtures("stand_ins")
 def test_it_is_private_on_loopback_and_leaves_nothing_behind(short: Path) -> None:
     before = dict(os.environ)
-    with contextlib.closing(RayPool(1, never_built, worker_factory=Answering).open()):
+    with contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool:
+        pool.open()
         (own,) = short.iterdir()
         assert own.stat().st_mode & 0o777 == 0o700
         ours = [psutil.Process(), *psutil.Process().children(recursive=True)]
@@ -56,7 +58,8 @@ from test_pool import Answering, make_recipes, make_task, never_built
 from cluster.workers.pool import Outcome
 from cluster.workers.ray_pool import RayPool
 
-pool = RayPool(1, never_built, worker_factory=Answering).open()
+pool = RayPool(1, never_built, worker_factory=Answering)
+pool.open()
 print(pool.run(Outcome(make_task(), make_recipes(8))).done, flush=True)
 time.sleep(float(sys.argv[1]))
 pool.close()
@@ -94,7 +97,7 @@ def test_a_folder_that_ray_cannot_use_is_named_with_the_variable(
         (tmp_path / folder).mkdir()
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / folder))
     with pytest.raises(PoolError, match=rf"^Ray cannot be started: .*{why}.*; set RAY_TMPDIR to a folder with room"):
-        RayPool(1, never_built).open()
+        open_pool(1, None, 0.0, never_built)
     assert list(tmp_path.glob("*/gs-*")) == []
 
 

@@ -242,10 +242,12 @@ def test_experience_is_in_order_and_what_is_asked_for_has_a_name() -> None:
         collected.add(0, Chunk(slice(0, 1), slice(first, stop)), *answer)
     assert collected.progress() == (10, 10)
     assert list(dict.fromkeys(collected.experience.rewards)) == list(range(10))
-    assert collected.identify(Chunk(slice(0, 1), slice(3, 5))) == "episode 3 (key 0x3, exploration 0)"
+    assert (
+        collected.identify(Chunk(slice(0, 1), slice(3, 5)))
+        == "episodes 3 to 4 (first: episode 3 (key 0x3, exploration 0))"
+    )
     outcome, piece = Outcome(make_task(), make_recipes(9)), Chunk(slice(5, 8), slice(0, 2))
-    assert outcome.identify(piece) == "member 5 (cross of rows 5 and 7, seed 5, key 0x3039)"
-    assert outcome.span(piece) == "members 5 to 7"
+    assert outcome.identify(piece) == "members 5 to 7 (first: member 5 (cross of rows 5 and 7, seed 5, key 0x3039))"
     assert last_line(MemoryError()) == "MemoryError"
     assert last_line(ValueError("300 is\nnot to be had")) == "ValueError: not to be had"
 

@@ -83,7 +83,8 @@ def pool(held: list[RayPool], folder: Path) -> RayPool:
     for path in folder.iterdir():
         path.unlink()
     if not held:
-        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)).open())
+        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)))
+        held[0].open()
     wait_until(lambda: held[0].run(Outcome(make_task(), make_recipes(512))) and len(held[0].pids()) == 2)
     return held[0]
 
@@ -175,7 +176,8 @@ def test_a_ray_that_is_in_use_is_left_alone(pool: RayPool) -> None:
 def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
     (task, maps), recipes = drive_task(), make_recipes(200)
     with contextlib.closing(RayPool(2, lambda _, seed: maps[seed], worker_factory=Inspecting)) as pool:
-        first = pool.open().run(Outcome(task, recipes))
+        pool.open()
+        first = pool.run(Outcome(task, recipes))
         assert first.results.tobytes() == Worker().evaluate(task, maps, recipes)[0].tobytes()
         processes = psutil.Process().children(recursive=True)
     assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
@@ -184,8 +186,11 @@ def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
 @pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_pool, "MAX_DEATHS", 3)
-    with pytest.raises(PoolError, match=r"^workers keep dying \(4 in a row\); the last time TypeError: .*'folder'$"):
-        RayPool(1, never_built, worker_factory=Obeying).open()  # type: ignore[arg-type]
+    with (
+        contextlib.closing(RayPool(1, never_built, worker_factory=Obeying)) as pool,  # type: ignore[arg-type]
+        pytest.raises(PoolError, match=r"^workers keep dying \(4 in a row\); the last time .*TypeError: .*'folder'$"),
+    ):
+        pool.open()
 
 
 # --- Clusters, which are joined by processes of their own: Ray reads a token once -------------------------------------

@@ -11,6 +11,7 @@ import site
 import subprocess
 import sys
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 from commands import command_line, descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
-PROGRAMS = "unshare nsenter ip ss sshd ssh ssh-keygen rsync uptime".split()  # `ray up` calls the last one on a host
+PROGRAMS = ("unshare", "nsenter", "ip", "ss", "sshd", "ssh", "ssh-keygen", "rsync", "uptime")  # `ray up` calls the last
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
 # What a shell starts with on a host.
 ENVIRONMENT = {"HOME": str(HOME), "PATH": SEARCH, "LANG": "C.UTF-8", "TERM": "dumb", "RAY_USAGE_STATS_ENABLED": "0"}
@@ -65,9 +66,10 @@ def package_folders() -> set[str]:
     return {str(folder) for folder in folders if folder.exists()}
 
 
+@dataclass
 class Command:
-    def __init__(self, process: subprocess.Popen[bytes], log: Path):
-        self.process, self.log = process, log
+    process: subprocess.Popen[bytes]
+    log: Path
 
     def finish(self, timeout: float, code: int = 0) -> str:
         """Wait for its end, which has to be with that exit code; returns its output, errors included."""
