@@ -59,10 +59,10 @@ def compile_ahead(settings: RunSettings) -> None:
     try:
         for part in PARTS:  # -P: not from this folder
             compilers.append(Child([sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what]))
-        while any(compiler.exit_code() is None for compiler in compilers):
+        while None in (codes := [compiler.exit_code() for compiler in compilers]):
             stopping.check()
             time.sleep(LOOK_S)
-        if all(compiler.exit_code() == 0 for compiler in compilers):
+        if not any(codes):
             with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
                 _marker(settings).touch()
     finally:

@@ -61,10 +61,11 @@ class Worker:
 
         Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
         """
-        started, found = time.perf_counter(), tuple[Any, ...]()
+        started = time.perf_counter()
         task = replace(task, episodes=task.episodes[columns], worlds=task.worlds[columns])
         if isinstance(task, CollectTask):
-            found = self.collect(replace(task, epsilons=task.epsilons[columns], keys=task.keys[columns]), maps)
+            task = replace(task, epsilons=task.epsilons[columns], keys=task.keys[columns])
+            found: tuple[Any, ...] = self.collect(task, maps)
         else:
             found = self.evaluate(task, maps, recipes)
         return *found, time.perf_counter() - started

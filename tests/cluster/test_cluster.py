@@ -229,7 +229,8 @@ def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
 
 @pytest.mark.e2e
 def test_who_can_reach_the_cluster(up: Machines, root: Path) -> None:
-    refused = up.laptop.start(BIN / "gridsim-evolve", "--address", f"{up.head.address}:6379", PYTHONPATH=str(root))
+    here = {"PYTHONPATH": str(root), "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1])}
+    refused = up.laptop.start(BIN / "gridsim-evolve", "--address", f"{up.head.address}:6379", **here)
     assert "wants its token" in refused.finish(60, code=1)
     assert (up.worker.home / ".ray/auth_token").read_text() == (up.laptop.home / ".ray/auth_token").read_text()
     assert (up.worker.home / ".ray/auth_token").stat().st_mode & 0o77 == 0

@@ -1,6 +1,7 @@
 """A Ray of our own on this machine: what it touches, what its workers import, and what a run does without it."""
 
 import contextlib
+import functools
 import os
 import re
 import signal
@@ -14,12 +15,14 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
 from commands import BIN, command_line, descendants, finish, ray_workers, rows, running, same_run, wait_until
-from test_pool import Answering, never_built
+from test_pool import Answering, drive_task, make_recipes, never_built
 
+from cluster.workers import ray_pool
 from cluster.workers.open import open_pool
-from cluster.workers.pool import PoolError
+from cluster.workers.pool import Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.ray_session import OWN_ENVIRONMENT
+from cluster.workers.worker import Worker
 
 SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "40", "--seed", "5"]
 REFERENCE = ("gridsim-evolve", *SMALL)
@@ -50,6 +53,46 @@ def test_it_is_private_on_loopback_and_leaves_nothing_behind(short: Path) -> Non
         commands = " ".join(command_line(process.pid) for process in ours)
         assert OWN_ENVIRONMENT["RAY_AUTH_TOKEN"] not in commands
     assert list(short.iterdir()) == []
+
+
+class Inspecting(Worker):
+    """Fails where something is wrong with its process or its inputs."""
+
+    def evaluate(self, task, maps, recipes):
+        for array in (task.parents, task.episodes, recipes, *(each.road.field for each in maps)):
+            assert array.flags.aligned
+        assert not any(each.road.field.flags.writeable for each in maps), "they are copies"
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN, "Ctrl-C would reach a worker"
+        assert os.environ.get("OMP_NUM_THREADS") == "1", "a worker has more than one thread"
+        assert os.nice(0) == 0, "busy programs would starve it"
+        assert psutil.Process().memory_full_info().uss <= 220 << 20
+        return super().evaluate(task, maps, recipes)
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("stand_ins")
+def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
+    (task, maps), recipes = drive_task(), make_recipes(200)
+    with contextlib.closing(RayPool(2, lambda _, seed: maps[seed], worker_factory=Inspecting)) as pool:
+        pool.open()
+        driven = pool.run(Outcome(task, recipes))
+        assert driven.results.tobytes() == Worker().evaluate(task, maps, recipes)[0].tobytes()
+        processes = psutil.Process().children(recursive=True)
+    assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("stand_ins")
+def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_pool, "MAX_DEATHS", 3)
+    factory = functools.partial(Answering, "too much")  # type: ignore[call-arg]
+    with (
+        contextlib.closing(RayPool(1, never_built, worker_factory=factory)) as pool,
+        pytest.raises(
+            PoolError, match=r"^workers keep dying \(4 in a row\); the last time .*TypeError: .* arguments?$"
+        ),
+    ):
+        pool.open()
 
 
 SCRIPT = """
@@ -122,10 +165,11 @@ def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(
 ) -> None:
     run = tmp_path / "runs/r"
     with running("gridsim-evolve", *SMALL, "--workers", "1", "--name", "r", cwd=tmp_path) as process:
-        wait_until(lambda: (rows(run) and ray_workers(process.pid)) or process.poll() is not None)
-        wait_until(lambda: len(rows(run)) > 2 or process.poll() is not None)
+        wait_until(lambda: rows(run) or process.poll() is not None)
+        process.send_signal(signal.SIGSTOP)  # or it may be done before its Ray is killed
         (victim,) = [pid for pid in descendants(process.pid) if f"/{lost}" in command_line(pid).partition(" ")[0]]
         psutil.Process(victim).kill()
+        process.send_signal(signal.SIGCONT)
         _, err = process.communicate(timeout=60)
     assert process.returncode == 1
     said, hint = err.splitlines()
