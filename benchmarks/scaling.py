@@ -8,8 +8,6 @@ file), by one and by two threads of this process in turns, and then by one and b
     threads_over_workers            car-steps a second by two threads over that by two Ray workers
     overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 Ray workers; median
     thread_overhead_ms              the same of 2 threads
-    bytes_per_child                 sent to Ray workers per member and generation, both ways
-    broadcast_bytes_per_generation  put into Ray's object store per generation: a few genomes, episodes, new maps
     start_workers_s                 until a pool of 2 Ray workers is open
     children_per_s                  members that the search asks for, the pool sends and collects, and the search
                                     recombines, with Ray workers that answer at once: the coordinator's ceiling
@@ -86,7 +84,7 @@ class Generations:
         self._search = Recombination(PolicySpec.parse(champion.policy), settings.search_config(), settings.seed)
         self._search.start_from(champion.genome)
         self._search.sigma = SIGMA
-        self.driven: list[Outcome] = []
+        self.driven: list[tuple[Outcome, float]] = []  # and how long each took, s
 
     def next(self) -> None:
         """Drive one."""
@@ -95,21 +93,19 @@ class Generations:
         parts = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         names = tuple((self._scenario, seed) for seed in episodes.maps)
         base = (self._policy, episodes.rows, episodes.worlds, names, SimConfig())
-        outcome = self._pool.evaluate(Task(*base, asked.parents, asked.key, asked.mutation), asked.recipes, parts)
+        task, begun = Task(*base, asked.parents, asked.key, asked.mutation), time.perf_counter()
+        outcome = self._pool.run(Outcome(task, asked.recipes, parts))
+        self.driven.append((outcome, time.perf_counter() - begun))
         results = np.concatenate([outcome.results[part] for part in parts])
         self._search.tell(fitness.scalar(results, episodes.rows["target"][:e].astype(np.float64)))
-        self.driven.append(outcome)
 
     def figures(self) -> dict[str, float]:
         """Of all but the first ones."""
         driven = self.driven[WARM:]
-        members = len(driven[0].recipes)
         return {
-            "wall_s": sum(call.wall_s for call in driven),
-            "car_steps": sum(float(call.results["steps"].sum()) for call in driven),
-            "overhead_ms": 1e3 * statistics.median(call.wall_s - max(call.busy_s.values()) for call in driven),
-            "bytes": statistics.median((call.bytes_down + call.bytes_up) / members for call in driven),
-            "broadcast": statistics.median(call.broadcast_bytes for call in driven),
+            "wall_s": sum(wall_s for _, wall_s in driven),
+            "car_steps": sum(float(call.results["steps"].sum()) for call, _ in driven),
+            "overhead_ms": 1e3 * statistics.median(wall_s - max(call.busy_s.values()) for call, wall_s in driven),
         }
 
 
@@ -136,7 +132,7 @@ def children_per_s(children: int) -> float:
             asked = search.ask()
             parts = [Chunk(group, slice(2 * g, 2 * g + 2)) for g, group in enumerate(asked.groups)]
             task = Task(str(spec), episodes, worlds, (), config, asked.parents, asked.key, asked.mutation)
-            results = pool.evaluate(task, asked.recipes, parts).results
+            results = pool.run(Outcome(task, asked.recipes, parts)).results
             search.tell(fitness.scalar(np.concatenate([results[part] for part in parts]), 150.0))
             rates.append(children / (time.perf_counter() - begun))
     return statistics.median(rates[1:])
@@ -174,8 +170,6 @@ def main() -> None:
         "thread_overhead_ms": two["overhead_ms"],
         "car_steps_per_s_2_workers": pair["car_steps"] / pair["wall_s"],
         "car_steps_per_s_2_threads": two["car_steps"] / two["wall_s"],
-        "bytes_per_child": pair["bytes"],
-        "broadcast_bytes_per_generation": pair["broadcast"],
         "start_workers_s": start_s,
         "children_per_s": rate,
     }

@@ -30,7 +30,7 @@ RUNS = {
         ["--quick", "--json"],
         {
             "speedup_2_threads", "speedup_2_workers", "threads_over_workers", "overhead_ms_per_generation",
-            "bytes_per_child", "broadcast_bytes_per_generation", "children_per_s",
+            "children_per_s",
         },
     ),
     "soak.py": (

@@ -112,7 +112,7 @@ class Dqn(Learning):
         brought = self.pool.start(Collected(task))
         yield from self._wait("collect", brought, self._train)
         self.replay.add(brought.experience)
-        results = brought.results[:, 0]
+        results = brought.results[0]
         steps = int(results["steps"].sum())
         self.updates_due += steps * s.updates / 1000.0
         self.mean_steps = steps / len(results)

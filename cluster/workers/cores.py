@@ -12,28 +12,19 @@ from pathlib import Path
 
 def cores(root: Path = Path("/")) -> int:
     """CPU cores that this process may use, at least 1. `root` is where /proc and /sys are."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return math.ceil(min([usable, *_quotas(root)]))
-
-
-def _quotas(root: Path) -> list[float]:
-    """CPU quotas, in cores, of this process's control groups and of all above them; none outside Linux."""
-    found = []
-    groups = root / "sys/fs/cgroup"
-    with contextlib.suppress(OSError):
+    least = float(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    with contextlib.suppress(OSError):  # no Linux
         for line in (root / "proc/self/cgroup").read_text().splitlines():
             _, controllers, path = line.split(":", 2)
-            if controllers == "":  # version 2
-                top, files = groups, ["cpu.max"]
-            elif "cpu" in controllers.split(","):  # version 1
-                top, files = groups / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
-            else:
+            if controllers and "cpu" not in controllers.split(","):
                 continue
-            # In a container, the path may be that on the host, of which only the top is seen.
+            folder, files = root / "sys/fs/cgroup", ["cpu.max"]
+            if controllers:  # version 1
+                folder, files = folder / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
+            # Those of all groups above count. In a container the path may be the host's, of which only the top is seen.
             for name in (".", *path.split("/")):
-                top /= name
+                folder /= name
                 with contextlib.suppress(OSError, ValueError):  # no such group; "max", no quota
-                    quota, period = " ".join((top / file).read_text() for file in files).split()
-                    if int(quota) > 0:  # version 1 has -1 for no quota
-                        found.append(int(quota) / int(period))
-    return found
+                    quota, period = " ".join((folder / file).read_text() for file in files).split()
+                    least = min(least, int(quota) / int(period) if int(quota) > 0 else least)  # -1: no quota
+    return math.ceil(least)

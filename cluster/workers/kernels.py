@@ -28,7 +28,7 @@ from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
-from gridsim.maps.map import Map, blank, sample_starts
+from gridsim.maps.map import blank, sample_starts
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.simulator import views
@@ -54,17 +54,15 @@ def is_compiled(settings: RunSettings) -> bool:
 
 def compile_ahead(settings: RunSettings) -> None:
     """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
-    if is_compiled(settings):
-        return
     what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
     compilers = list[Child]()
     try:
         for part in PARTS:  # -P: not from this folder
             compilers.append(Child([sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what]))
-        while any(compiler.exit_code() is None for compiler in compilers):
+        while None in (codes := [compiler.exit_code() for compiler in compilers]):
             stopping.check()
             time.sleep(LOOK_S)
-        if all(compiler.exit_code() == 0 for compiler in compilers):
+        if not any(codes):
             with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
                 _marker(settings).touch()
     finally:
@@ -72,51 +70,27 @@ def compile_ahead(settings: RunSettings) -> None:
             compiler.close(0.0)
 
 
-def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray]:
-    """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic."""
-    config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
-    road, episodes = blank(), np.zeros(1, dtype=EPISODE)
+def compile_part(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
+    """Compile one of PARTS in this process, or load it from the cache, by the smallest drive: one step, on no road."""
+    config, spec, road = SimConfig(), PolicySpec.parse(policy), blank()
+    genome, keys = np.zeros(spec.size, dtype=np.float32), np.zeros(1, dtype=np.uint64)
+    episodes = np.zeros(1, dtype=EPISODE)
     episodes["target"] = episodes["steps"] = 1
-    worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config)
-    return config, road, genome, episodes, worlds
-
-
-def compile_kernels(policy: str, traffic: int, command: str) -> None:
-    """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
-    config, road, genome, episodes, worlds = _smallest(policy, traffic)
-    made = recipes(2)
-    made["kind"] = Kind.NEW
-    task = Task(policy, episodes, worlds, (), config, genome[None], 1, Mutation())
-    Worker().answer(task, [road], made, 0, 1)
-    if command == DqnSettings.command:
-        epsilons, keys = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.uint64)
-        collecting = CollectTask(policy, episodes, worlds, (), config, genome, epsilons, keys)
-        Worker().answer(collecting, [road], made, 0, 1)
-
-
-def compile_roads(scenario: str, traffic: int) -> None:
-    """Compile, or load from the cache, what builds a scenario's maps."""
-    road = build(scenario, 0)
-    starts = sample_starts(road, 1, np.random.default_rng(0))
-    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig())
-
-
-def compile_drive(policy: str, traffic: int) -> None:
-    """Compile, or load from the cache, what records and draws a drive."""
-    config, road, genome, episodes, worlds = _smallest(policy, traffic)
-    start = episodes["start"][0]
-    _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, 1.0, 1, config, worlds[0])
+    worlds = spawn(road.network, episodes["start"], traffic, keys, config)
+    if part == "kernels":
+        shared, made = (policy, episodes, worlds, (), config), recipes(2)
+        made["kind"] = Kind.NEW
+        Worker().answer(Task(*shared, genome[None], 1, Mutation()), [road], made, slice(0, 1))
+        if command == DqnSettings.command:
+            Worker().answer(
+                CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
+            )
+        return
+    built = build(scenario, 0)
+    spawn(built.network, sample_starts(built, 1, np.random.default_rng(0)), traffic, keys, config)
+    _, cars, others = trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
     views(road, cars, others, config)
     clearances(road.road, freeze(cars[:, :2]))
-
-
-def compile_part(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
-    """Compile one of PARTS in this process."""
-    if part == "kernels":
-        compile_kernels(policy, traffic, command)
-    else:
-        compile_roads(scenario, traffic)
-        compile_drive(policy, traffic)
 
 
 def everything_by_default() -> list[RunSettings]:
@@ -130,10 +104,11 @@ def everything_by_default() -> list[RunSettings]:
     ]
 
 
-def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
+def main(part: str, *what: str) -> None:
     """Compile one part, or everything, in this process."""
     if part != "everything":
-        compile_part(part, scenario, policy, int(cars), command)
+        scenario, policy, traffic, command = what
+        compile_part(part, scenario, policy, int(traffic), command)
         return
     for settings in everything_by_default():
         for each in PARTS:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import time
 from abc import ABC, abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -29,7 +28,7 @@ class PoolError(GridSimError):
 
 
 class Chunk(NamedTuple):
-    """Some members (rows), on some of the task's episodes (columns). Of a batch of experience, rows are episodes."""
+    """Some members (rows), on some of the task's episodes (columns). A batch of experience is one row."""
 
     rows: slice
     columns: slice
@@ -41,48 +40,41 @@ def size(chunk: Chunk) -> int:
 
 
 class Call(ABC):
-    """What is asked of a pool; after that, what came back, and what it took."""
+    """What is asked of a pool, and after that what came back."""
 
-    noun: ClassVar[str]  # what its rows are
+    noun: ClassVar[str]
+    axis: ClassVar[int]  # whether rows or columns are what the noun says
 
-    def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk], rows: int, columns: int):
-        self.task, self.recipes, self.asked = task, recipes, asked
+    def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk] | None, rows: int):
+        columns = len(task.episodes)
+        self.task, self.recipes = task, recipes
+        self.asked = [Chunk(slice(0, rows), slice(0, columns))] if asked is None else asked
         self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for
-        self.warnings: list[str] = []  # a line for each silent worker that was replaced, and for memory that is full
-        self.total, self.done = sum(map(size, asked)), 0  # episodes to be driven, and those that are
-        self.started = time.perf_counter()
-        self.wall_s = 0.0  # from the start until the last result was taken in
-        self.busy_s: dict[int, float] = {}  # seconds of work, by the worker's number, which a replacement keeps
-        self.retries = 0  # pieces that were sent again because their worker died
-        self.bytes_down = self.bytes_up = 0  # sent to workers, recipes mostly, and back; none by threads
-        self.broadcast_bytes = 0  # put into Ray's object store: the task and the maps that were new to it
+        self.warnings: list[str] = []  # a line for each worker that was replaced
+        self.total, self.done = sum(map(size, self.asked)), 0  # episodes to be driven, and those that are
+        self.busy_s: dict[int, float] = defaultdict(float)  # seconds of work by each worker, for statistics only
 
     def progress(self) -> tuple[int, int]:
         """Members (or episodes of experience) that are done, partly evaluated ones in part, and how many there are."""
-        rows = len(self.results)
-        return (rows * self.done // self.total if self.total else 0), rows
-
-    def work(self, piece: Chunk) -> tuple[np.ndarray, int, int]:
-        """Arguments of `Worker.answer` for a piece: its recipes, its first episode and the one after its last."""
-        episodes = piece.rows if isinstance(self.task, CollectTask) else piece.columns
-        return self.recipes[piece.rows], episodes.start, episodes.stop
+        n = self.results.shape[self.axis]
+        return (n * self.done // self.total if self.total else 0), n
 
     @abstractmethod
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         """Take in what `Worker.answer` returned for a piece."""
 
     def _count(self, worker: int, piece: Chunk, results: np.ndarray, seconds: float) -> None:
-        self.results[piece.rows, piece.columns] = results
+        self.results[piece] = results
         self.done += size(piece)
-        self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
+        self.busy_s[worker] += seconds
 
-    def rows_of(self, piece: Chunk) -> str:
+    def span(self, piece: Chunk) -> str:
         """A piece in words."""
-        return f"{self.noun} {piece.rows.start} to {piece.rows.stop - 1}"
+        return f"{self.noun} {piece[self.axis].start} to {piece[self.axis].stop - 1}"
 
     @abstractmethod
-    def identify(self, row: int) -> str:
-        """A member with its recipe, or an episode of experience, so that it can be tried again."""
+    def identify(self, piece: Chunk) -> str:
+        """A piece in words, and its first member's recipe, or episode of experience, so that it can be tried again."""
 
 
 class Outcome(Call):
@@ -93,14 +85,13 @@ class Outcome(Call):
         asked: which members drive which episodes, the longest first; None is all members on all episodes.
     """
 
-    noun = "members"
+    noun, axis = "members", 0
     task: Task
 
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
-        n, e = len(recipes), len(task.episodes)
-        super().__init__(task, recipes, rectangle(n, e) if asked is None else asked, n, e)
-        self.rewound = np.zeros((e, 5), np.float32)  # states so many steps before the end as `rewind`
-        self.worlds = np.zeros_like(task.worlds)  # the traffic at that time, float32 [episodes, cars, world.FIELDS]
+        super().__init__(task, recipes, asked, len(recipes))
+        # States so many steps before the end as `rewind`, and the traffic then, float32 [episodes, cars, world.FIELDS].
+        self.rewound, self.worlds = np.zeros((len(task.episodes), 5), np.float32), np.zeros_like(task.worlds)
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         results, rewound, worlds, seconds = answer
@@ -108,22 +99,23 @@ class Outcome(Call):
             self.rewound[piece.columns], self.worlds[piece.columns] = rewound[0], worlds[0]
         self._count(worker, piece, results, seconds)
 
-    def identify(self, row: int) -> str:
+    def identify(self, piece: Chunk) -> str:
+        row = piece.rows.start
         recipe = self.recipes[row]
         kind = Kind(int(recipe["kind"])).name.lower()
         parents = f"rows {recipe['a']} and {recipe['b']}"
-        return f"member {row} ({kind} of {parents}, seed {recipe['seed']}, key {self.task.key:#x})"
+        first = f"member {row} ({kind} of {parents}, seed {recipe['seed']}, key {self.task.key:#x})"
+        return f"{self.span(piece)} (first: {first})"
 
 
 class Collected(Call):
-    """A batch of experience: the task's policy drives its episodes. Rows are episodes, in one column."""
+    """A batch of experience: the task's policy drives its episodes, the columns."""
 
-    noun = "episodes"
+    noun, axis = "episodes", 1
     task: CollectTask
 
     def __init__(self, task: CollectTask):
-        n = len(task.episodes)
-        super().__init__(task, np.zeros(0, RECIPE), rectangle(n, 1), n, 1)
+        super().__init__(task, np.zeros(0, RECIPE), None, 1)
         self._parts: dict[int, Experience] = {}  # by their first episodes
 
     @cached_property
@@ -132,20 +124,16 @@ class Collected(Call):
         return join([self._parts.pop(first) for first in sorted(self._parts)])
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
-        experience, results, seconds = answer
-        self._parts[piece.rows.start] = experience
-        self._count(worker, piece, results[:, None], seconds)
+        self._parts[piece.columns.start], results, seconds = answer
+        self._count(worker, piece, results, seconds)
 
-    def identify(self, row: int) -> str:
-        return f"episode {row} (key {self.task.keys[row]:#x}, exploration {self.task.epsilons[row]:.3g})"
+    def identify(self, piece: Chunk) -> str:
+        e, task = piece.columns.start, self.task
+        first = f"episode {e} (key {task.keys[e]:#x}, exploration {task.epsilons[e]:.3g})"
+        return f"{self.span(piece)} (first: {first})"
 
 
 AnyCall = TypeVar("AnyCall", bound=Call)
-
-
-def rectangle(rows: int, columns: int) -> list[Chunk]:
-    """The first `rows` members on the first `columns` episodes."""
-    return [Chunk(slice(0, rows), slice(0, columns))]
 
 
 class WorkerPool(ABC):
@@ -162,68 +150,44 @@ class WorkerPool(ABC):
 
     def start(self, call: AnyCall) -> AnyCall:
         """Have a call done. Returns it at once."""
-        call.started, self._call = time.perf_counter(), call
+        self._call = call
         self._start(call)
         return call
 
     def wait(self, call: Call, timeout_s: float) -> bool:
         """Wait until something comes in, at most `timeout_s`. Returns whether anything is left to be done."""
-        ends = time.monotonic() + timeout_s
-        while call.done < call.total:
+        if call.done < call.total:
             stopping.check()
             if call is not self._call:
                 raise PoolError("another call has taken this one's place, or the pool of workers is closed")
-            left_s = ends - time.monotonic()
             try:
-                came = self._take_in(call, max(min(left_s, LOOK_S), 0.0))
+                self._take_in(timeout_s)
             except Exception:
                 self._call = None
                 raise
-            call.wall_s = time.perf_counter() - call.started
-            if came or left_s <= 0.0:
-                break
         return call.done < call.total
 
     def run(self, call: AnyCall) -> AnyCall:
         """Start a call and wait for all of it."""
         self.start(call)
-        while self.wait(call, 1.0):
+        while self.wait(call, LOOK_S):
             pass
         return call
-
-    def evaluate(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None) -> Outcome:
-        """Run an `Outcome`."""
-        return self.run(Outcome(task, recipes, asked))
-
-    def collect(self, task: CollectTask) -> Collected:
-        """Run a `Collected`."""
-        return self.run(Collected(task))
 
     @abstractmethod
     def _start(self, call: Call) -> None:
         """Have a call done in place of the one before."""
 
     @abstractmethod
-    def _take_in(self, call: Call, timeout_s: float) -> bool:
-        """Take in what has come; if there is nothing, wait for it, at most `timeout_s`. Returns whether any came."""
+    def _take_in(self, timeout_s: float) -> None:
+        """Take in what has come for `_call`; if there is nothing, wait for it, at most `timeout_s`."""
 
     @abstractmethod
     def close(self) -> None:
         """Stop all that the pool started. May be called again, and at any moment."""
 
 
-def _goals(task: AnyTask) -> np.ndarray:
-    """How far each episode may go (m), with a step for a metre: float64 [columns]. A batch of experience has one."""
-    goals = np.maximum(np.minimum(task.episodes["target"], task.episodes["steps"]), 1).astype(np.float64)
-    return goals[:1] if isinstance(task, CollectTask) else goals
-
-
-def metres(task: AnyTask, chunk: Chunk) -> float:
-    """How far the members of a chunk drive if all of them reach their targets."""
-    return float(_goals(task)[chunk.columns].sum()) * (chunk.rows.stop - chunk.rows.start)
-
-
-def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, least_m: float, most_m: float) -> list[Chunk]:
+def cut(call: Call, workers: int, least_m: float, most_m: float) -> list[Chunk]:
     """Cut what is asked for into pieces, by the metres that it may take: large ones first, small ones last.
 
     Each takes half of a worker's share of the rest, so that no worker waits long for the slowest (guided
@@ -232,23 +196,27 @@ def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, least_m: float, mos
 
     Args: the least and the most metres of a piece. A metre takes a small network some microseconds at most.
     """
-    goals, pieces = _goals(task), list[Chunk]()
-    left = sum(metres(task, block) for block in asked)
+    episodes = call.task.episodes
+    goals = np.maximum(np.minimum(episodes["target"], episodes["steps"]), 1).astype(np.float64)  # a step for a metre
+
+    def metres(chunk: Chunk) -> float:
+        return (chunk.rows.stop - chunk.rows.start) * float(goals[chunk.columns].sum())
+
+    pieces, rest = list[Chunk](), [chunk for chunk in reversed(call.asked) if size(chunk)]
+    left = sum(map(metres, rest))
     least_m = min(least_m, left / (2 * workers))  # every worker gets some, however little there is
-    for rows, columns in asked:
-        ends = np.concatenate([[0.0], np.cumsum(goals[columns])])  # metres of one member, up to each episode
-        row, column = rows.start, 0
-        while row < rows.stop and len(ends) > 1:
-            room = min(max(left / (2 * workers), least_m), most_m)
-            if column == 0 and (ends[-1] <= room or len(ends) == 2):  # whole members, as many in each as in the next
-                parts = math.ceil((rows.stop - row) * ends[-1] / room)
-                stop, last = row + max((rows.stop - row) // parts, 1), len(ends) - 1
-            else:
-                last = int(np.searchsorted(ends, ends[column] + room * (1.0 + 1e-9), side="right")) - 1
-                stop, last = row + 1, max(last, column + 1)
-            pieces.append(Chunk(slice(row, stop), slice(columns.start + column, columns.start + last)))
-            left -= (stop - row) * (ends[last] - ends[column])
-            row, column = (stop, 0) if last == len(ends) - 1 else (row, last)
+    while rest:
+        rows, columns = piece = rest.pop()
+        room, wanted = min(max(left / (2 * workers), least_m), most_m), metres(piece)
+        if wanted <= room * (1.0 + 1e-9) or size(piece) == 1:
+            pieces.append(piece)
+            left -= wanted
+        elif rows.stop - rows.start > 1:
+            middle = rows.start + max(int((rows.stop - rows.start) * room / wanted), 1)
+            rest += [Chunk(slice(middle, rows.stop), columns), Chunk(slice(rows.start, middle), columns)]
+        else:
+            middle = columns.start + max(int((columns.stop - columns.start) * room / wanted), 1)
+            rest += [Chunk(rows, slice(middle, columns.stop)), Chunk(rows, slice(columns.start, middle))]
     return pieces
 
 

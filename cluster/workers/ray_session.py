@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import logging
 import os
 import secrets
@@ -12,24 +11,21 @@ import socket
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cluster
-import evolution
-import gridsim
 from cluster import stopping
 from cluster.workers.child import Child
-from cluster.workers.pool import LOOK_S, PoolError
+from cluster.workers.pool import LOOK_S, PoolError, last_line
 from gridsim.jit import CACHE_FOLDER
 
-PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
+PACKAGES = ("cluster", "evolution", "gridsim")  # that are sent to a cluster's workers
 ENVIRONMENT = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
-    "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job that was submitted with files of its own keeps them beside ours
+    "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job may have been submitted with files of its own
     "RAY_CLIENT_MODE": "0",  # Ray sets this and the next one otherwise, but only when there are threads
     "PYTHONBREAKPOINT": "ray.util.rpdb._driver_set_trace",
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # prints nothing, deaths of workers included
@@ -60,39 +56,38 @@ MEANINGS = {  # of Ray's errors, by what is in their texts
 }
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
 ENDING_S = 10.0  # for Ray's processes to end
-_prepared_own = False  # whether Ray, which reads its variables when it is imported, has those of OWN_ENVIRONMENT
+_has_token = False  # whether Ray, which reads its variables when it is imported, has those of OWN_ENVIRONMENT
 
 
-def prepare(own: bool) -> list[str]:
-    """Set Ray's variables, before there are threads: one that reads the environment at that moment would crash.
+class Session:
+    """This process's connection to a cluster, or to a Ray of our own: `ray start`, its files in a private folder."""
 
-    Returns: their names, to be removed when Ray is left: other programs would use our token. Raises PoolError.
-    """
-    global _prepared_own
-    ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
-    if getattr(ray, "is_initialized", bool)():
-        raise PoolError(f"Ray is in use in this process already: call ray.shutdown() first, {cure}")
-    if own and ray and not _prepared_own and not OWN_ENVIRONMENT.keys() <= os.environ.keys():
-        raise PoolError(f"Ray was imported before it could be given a token: open the pool before that, {cure}")
-    _prepared_own = _prepared_own or own
-    users = os.environ.keys() & {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
-    wanted = ENVIRONMENT | (OWN_ENVIRONMENT if own else CLUSTER_ENVIRONMENT)
-    new = [name for name in wanted if name not in os.environ and not (users and name == "RAY_AUTH_TOKEN")]
-    os.environ.update({name: wanted[name] for name in new})
-    return new
+    _folder, _joined = "", False
+    _head: Child | None = None
 
+    def open(self, cpus: int, address: str | None, patience_s: float) -> Any:
+        """Join a cluster, or start a Ray of our own with so many CPUs. Returns the module `ray`. Raises PoolError."""
+        global _has_token
+        ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
+        if getattr(ray, "is_initialized", bool)():
+            raise PoolError(f"Ray is in use in this process already: call ray.shutdown() first, {cure}")
+        if address is None and ray and not _has_token:
+            raise PoolError(f"Ray was imported before it could be given a token: open the pool before that, {cure}")
+        _has_token = _has_token or address is None
+        wanted = ENVIRONMENT | (OWN_ENVIRONMENT if address is None else CLUSTER_ENVIRONMENT)
+        new = wanted.keys() - os.environ.keys()
+        os.environ.update({name: wanted[name] for name in new})  # a thread that reads it just now would crash
+        try:
+            return self._join(address or self._start(cpus, patience_s))
+        finally:
+            for name in new:  # other programs would use our token
+                os.environ.pop(name, None)
 
-class OwnRay:
-    """A Ray of our own: `ray start`, its files in a private folder, as /tmp/ray is open to all users of a machine."""
-
-    def __init__(self) -> None:
-        self._folder = ""
-        self._head: Child | None = None
-
-    def start(self, cpus: int, patience_s: float) -> str:
-        """Start it, wait until it is up, and return its address. Raises PoolError."""
+    def _start(self, cpus: int, patience_s: float) -> str:
+        """Start a Ray of our own, wait until it is up, and return its address. Raises PoolError."""
         base, cure = os.environ.get("RAY_TMPDIR") or "/tmp", "set RAY_TMPDIR to a folder with room and a short path"
         try:
+            # Ray's own choice, /tmp/ray, is open to all users of a machine.
             self._folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))
         except OSError as error:
             raise PoolError(f"Ray cannot be started: {base}: {error.strerror}; {cure}") from None
@@ -103,12 +98,12 @@ class OwnRay:
             --include-dashboard=false --include-log-monitor=false --no-monitor --disable-usage-stats --temp-dir"""
         command = [sys.executable, "-P", "-m", "ray.scripts.scripts", "start", *flags.split(), f"{self._folder}/r"]
         log, found = Path(self._folder, "log"), Path(self._folder, "r/ray_current_cluster")
-        self._head = head = Child(command, os.environ | HEAD_ENVIRONMENT, log)
+        self._head = Child(command, os.environ | HEAD_ENVIRONMENT, log)
         ends = time.monotonic() + patience_s
         import ray  # noqa: F401 - it takes a second, in which Ray's processes start
 
         while not (address := found.read_text() if found.exists() else ""):
-            if head.exit_code() is not None:
+            if self._head.exit_code() is not None:
                 lines = log.read_text(errors="replace").splitlines()
                 said = [line for line in lines if "Error: " in line] or lines or ["its log is empty"]
                 raise PoolError(f"Ray cannot be started: {said[-1].strip()}; {cure}")
@@ -118,68 +113,47 @@ class OwnRay:
             time.sleep(LOOK_S)
         return address
 
+    def _join(self, address: str) -> Any:
+        """Connect to the Ray at an address, whose workers are sent our packages, and so run these sources."""
+        import ray
+
+        terminal, self._joined = os.dup(2), True
+        # In a thread Ray leaves the handlers of signals alone. Without a `working_dir` it puts this process's working
+        # folder first on its workers' path, where a user's `evolution.py` would be found in place of our package.
+        with tempfile.TemporaryDirectory() as empty, open(os.devnull, "w") as nowhere, ThreadPoolExecutor(1) as thread:
+            modules = [str(Path(__file__).parents[2] / package) for package in PACKAGES]
+            sent = {"py_modules": modules, "excludes": ["__pycache__"], "working_dir": empty}
+            quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+            os.dup2(nowhere.fileno(), 2)  # what it prints while it waits for an answer
+            try:
+                error = thread.submit(ray.init, address, runtime_env=sent, **quiet).exception()
+            finally:
+                os.dup2(terminal, 2)
+                os.close(terminal)
+        if error:
+            raise PoolError(f"could not join the Ray cluster at {address}: {reason(error)}") from error
+        return ray
+
     def check(self) -> None:
-        """Raise PoolError if one of its processes has ended: calls to Ray would then hang, or end this process."""
+        """Raise PoolError if a process of our own Ray has ended: calls to Ray would then hang, or end this process."""
         if self._head and not self._head.is_whole():
             logs, self._folder = f"{self._folder}/r/session_latest/logs", ""  # which are kept
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 
     def close(self) -> None:
-        """End its processes, and remove its folder."""
+        """Leave Ray; end one of our own, and remove its folder. May be called again."""
+        if self._joined:
+            gc.disable()  # a reference to Ray that another thread's collection frees while Ray stops ends this process
+            sys.modules["ray"].shutdown()
+            gc.enable()
         if self._head:
             self._head.close(ENDING_S)
-        self._head, ends = None, time.monotonic() + ENDING_S
+        self._joined, self._head, ends = False, None, time.monotonic() + ENDING_S
         while self._folder and os.path.exists(self._folder) and time.monotonic() < ends:
             shutil.rmtree(self._folder, ignore_errors=True)  # the last ones may still write to it
-
-
-def join(address: str) -> None:
-    """Connect to the Ray at an address, whose workers are sent our packages, and so run these sources.
-
-    Raises PoolError.
-    """
-    import ray
-
-    logging.getLogger("ray").setLevel(logging.CRITICAL)
-    terminal = os.dup(2)
-    # In a thread Ray leaves the handlers of signals alone. It cannot be interrupted there: `with` waits for its end.
-    with tempfile.TemporaryDirectory() as empty, open(os.devnull, "w") as nowhere, ThreadPoolExecutor(1) as thread:
-        os.dup2(nowhere.fileno(), 2)  # what it prints while it waits for an answer
-        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-        joined = thread.submit(ray.init, address, runtime_env=runtime_env(empty), **quiet)
-        try:
-            while not wait([joined], LOOK_S).done:
-                stopping.check()
-        finally:
-            os.dup2(terminal, 2)
-            os.close(terminal)
-    if error := joined.exception():
-        raise PoolError(f"could not join the Ray cluster at {address}: {reason(error)}") from error
-
-
-def runtime_env(empty: str) -> dict[str, Any]:
-    """Ray's `runtime_env`: our packages, beside what a Ray job brought.
-
-    Args: `empty` is an empty folder. Without a `working_dir`, Ray puts this process's working folder first on its
-    workers' path, where a user's `evolution.py` would be found in place of our package.
-    """
-    submitted = json.loads(os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")).get("runtime_env") or {}
-    modules = [str(Path(package.__path__[0])) for package in PACKAGES] + submitted.get("py_modules", [])
-    own_folder = {} if "working_dir" in submitted else {"working_dir": empty}
-    return {"py_modules": modules, "excludes": ["__pycache__"], **own_folder}
-
-
-def leave() -> None:
-    """Leave Ray, if this process is connected to it."""
-    ray: Any = sys.modules.get("ray")
-    if getattr(ray, "is_initialized", bool)():
-        gc.disable()  # a reference to Ray that another thread's collection frees while Ray stops ends this process
-        ray.shutdown()
-        gc.enable()
 
 
 def reason(error: BaseException) -> str:
     """What one of Ray's long messages means, in one line."""
     text = f"{type(error).__name__}: {error} {error.__cause__}"
-    last = (str(error) or type(error).__name__).strip().rpartition("\n")[2].strip()[:300]
-    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last)
+    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last_line(error)[:300])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from cluster.workers.cores import cores
@@ -20,10 +21,9 @@ Answer = tuple[Call, int, Chunk, tuple[Any, ...] | Exception]
 
 
 class ThreadPool(WorkerPool):
-    """Workers are threads, which take pieces from one queue. The caller's thread does not evaluate.
+    """Workers are threads. The caller's thread builds the maps and does not evaluate.
 
     Args:
-        build_map: builds a map, in the caller's thread.
         threads: how many; 0 is one for each core.
         worker_factory: makes what evaluates, which all threads share.
     """
@@ -31,50 +31,34 @@ class ThreadPool(WorkerPool):
     workers = 0
 
     def __init__(self, build_map: BuildMap, threads: int = 0, worker_factory: Callable[[], Worker] = Worker):
-        self._build_map = build_map
-        self._count = threads or cores()
-        self._worker = worker_factory()
-        self._pieces: queue.SimpleQueue[tuple[Call, Sequence[Map], Chunk] | None] = queue.SimpleQueue()
+        self._build_map, self._threads, self._worker = build_map, threads or cores(), worker_factory()
+        self._executor = ThreadPoolExecutor(self._threads)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        self._threads: list[threading.Thread] = []
 
     def _start(self, call: Call) -> None:
         maps = [self._build_map(*name) for name in call.task.maps]
-        for piece in cut(call.task, call.asked, self._count, LEAST_M, MOST_M):
-            self._pieces.put((call, maps, piece))
-        while len(self._threads) < self._count:
-            thread = threading.Thread(
-                target=self._work, args=(len(self._threads),), name=f"worker-{len(self._threads)}", daemon=True
-            )
-            thread.start()
-            self._threads.append(thread)
+        for piece in cut(call, self._threads, LEAST_M, MOST_M):
+            self._executor.submit(self._work, call, maps, piece)
 
-    def _work(self, number: int) -> None:
-        """Do pieces until there is a None."""
-        while item := self._pieces.get():
-            call, maps, piece = item
-            if call is self._call:
-                try:
-                    self._answers.put((call, number, piece, self._worker.answer(call.task, maps, *call.work(piece))))
-                except Exception as error:
-                    self._answers.put((call, number, piece, error))
+    def _work(self, call: Call, maps: Sequence[Map], piece: Chunk) -> None:
+        if call is self._call:
+            answer: tuple[Any, ...] | Exception
+            try:
+                answer = self._worker.answer(call.task, maps, call.recipes[piece.rows], piece.columns)
+            except Exception as error:
+                answer = error
+            self._answers.put((call, threading.get_ident(), piece, answer))
 
-    def _take_in(self, call: Call, timeout_s: float) -> bool:
+    def _take_in(self, timeout_s: float) -> None:
         try:
-            owner, number, piece, answer = self._answers.get(timeout=timeout_s)
+            call, thread, piece, answer = self._answers.get(timeout=timeout_s)
         except queue.Empty:
-            return False
-        if owner is not call:
-            return False
-        if isinstance(answer, Exception):
-            raise PoolError(f"a worker failed on {call.rows_of(piece)}: {last_line(answer)}") from answer
-        call.add(number, piece, *answer)
-        return True
+            return
+        if call is self._call:
+            if isinstance(answer, Exception):
+                raise PoolError(f"a worker failed on {call.span(piece)}: {last_line(answer)}") from answer
+            call.add(thread, piece, *answer)
 
     def close(self) -> None:
         self._call = None
-        for _ in self._threads:
-            self._pieces.put(None)
-        for thread in self._threads:
-            thread.join()
-        self._threads.clear()
+        self._executor.shutdown()

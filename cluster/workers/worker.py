@@ -47,6 +47,7 @@ class CollectTask(_Common):
 
 
 AnyTask = Task | CollectTask
+Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray]  # results, rewound states, rewound traffic
 
 
 class Worker:
@@ -55,23 +56,21 @@ class Worker:
     The `maps` of its methods are those of `task.maps`, in that order.
     """
 
-    def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int) -> tuple[Any, ...]:
-        """Do a chunk: recipes RECIPE [n] of a `Task`, and the task's episodes from `first` to before `stop`.
+    def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, columns: slice) -> tuple[Any, ...]:
+        """Do a chunk: recipes RECIPE [n] of a `Task`, on some of the task's episodes.
 
         Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
         """
-        started, these = time.perf_counter(), slice(first, stop)
-        task = replace(task, episodes=task.episodes[these], worlds=task.worlds[these])
-        found: tuple[Any, ...]
+        started = time.perf_counter()
+        task = replace(task, episodes=task.episodes[columns], worlds=task.worlds[columns])
         if isinstance(task, CollectTask):
-            found = self.collect(replace(task, epsilons=task.epsilons[these], keys=task.keys[these]), maps)
+            task = replace(task, epsilons=task.epsilons[columns], keys=task.keys[columns])
+            found: tuple[Any, ...] = self.collect(task, maps)
         else:
             found = self.evaluate(task, maps, recipes)
         return *found, time.perf_counter() - started
 
-    def evaluate(
-        self, task: Task, maps: Sequence[Map], recipes: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         """What `rollout.evaluate` returns for recipes RECIPE [n]."""
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)

@@ -24,7 +24,7 @@ from packaging.requirements import Requirement
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
 from cluster.compare.plan import Plan
-from cluster.workers.ray_session import PACKAGES, runtime_env
+from cluster.workers.ray_session import PACKAGES
 from gridsim import evolve
 from gridsim.jit import CACHE_FOLDER
 
@@ -65,7 +65,7 @@ def test_file_gives_each_machine_the_project_and_the_token(root: Path, name: str
     config = read(root, name)
     mounts = config["file_mounts"]
     assert mounts.pop("~/.ray/auth_token") == "~/.ray/auth_token"
-    assert {package.__name__ for package in PACKAGES} < set(mounts.values())
+    assert set(PACKAGES) < set(mounts.values())
     assert [path for path in mounts.values() if not (root / path).exists()] == []
     assert {there.removeprefix("~/gridsim/") for there in mounts} == set(mounts.values())
     for which in ("head", "worker"):
@@ -123,18 +123,6 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
 def test_the_guide_names_the_files_that_there_are(root: Path) -> None:
     guide = (root / "docs" / "cluster.md").read_text(encoding="utf-8")
     assert set(re.findall(r"cluster/(\w+)\.yaml", guide)) == {*LAUNCHED, "kuberay"}
-
-
-def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = runtime_env("/empty")
-    assert alone["working_dir"] == "/empty", "Ray would put the working folder of the command on its workers' path"
-    assert [Path(folder).name for folder in alone["py_modules"]] == ["cluster", "evolution", "gridsim"]
-    for submitted in (None, {"working_dir": "gcs://w.zip"}, {"py_modules": ["gcs://mine.zip"]}):
-        monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted}))
-        wanted = {**alone, "py_modules": [*alone["py_modules"], *(submitted or {}).get("py_modules", [])]}
-        if "working_dir" in (submitted or {}):
-            del wanted["working_dir"]
-        assert runtime_env("/empty") == wanted
 
 
 RAY = BIN / "ray"
@@ -208,11 +196,16 @@ def test_the_same_run_as_a_job(up: Machines) -> None:
         pytest.skip("needs pip install 'ray[default]'")
     found = up.worker.start(RAY.with_name("python"), "-c", "import gridsim.config")
     assert "No module named 'gridsim.config'" in found.finish(60, code=1), "it has no GridSim"
+    (up.laptop.folder / "tmp/mine").mkdir()
+    (up.laptop.folder / "tmp/mine/helper.py").touch()
+    brought = json.dumps({"py_modules": ["/tmp/mine"]})  # which the run's own stand in place of
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
     try:
         wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
-        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "gridsim-evolve", "--workers", 2]
-        run = up.laptop.start(RAY, *job, "--name", "j", *SMALL, RAY_AUTH_MODE="token")
+        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--runtime-env-json", brought]
+        run = up.laptop.start(
+            RAY, *job, "--", "gridsim-evolve", "--workers", 2, "--name", "j", *SMALL, RAY_AUTH_MODE="token"
+        )
         there = wait_until(lambda: drives(up.worker.pid) or (run.process.poll() is not None and "over"), UP_S)
         run.finish(UP_S)
     finally:
@@ -236,7 +229,8 @@ def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
 
 @pytest.mark.e2e
 def test_who_can_reach_the_cluster(up: Machines, root: Path) -> None:
-    refused = up.laptop.start(BIN / "gridsim-evolve", "--address", f"{up.head.address}:6379", PYTHONPATH=str(root))
+    here = {"PYTHONPATH": str(root), "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1])}
+    refused = up.laptop.start(BIN / "gridsim-evolve", "--address", f"{up.head.address}:6379", **here)
     assert "wants its token" in refused.finish(60, code=1)
     assert (up.worker.home / ".ray/auth_token").read_text() == (up.laptop.home / ".ray/auth_token").read_text()
     assert (up.worker.home / ".ray/auth_token").stat().st_mode & 0o77 == 0

@@ -17,13 +17,14 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 from commands import finish, wait_until
 from driving import to_bytes
-from test_pool import Answering, collect_drive_task, drive_task, make_collect_task, make_recipes, make_task, never_built
+from test_pool import Answering, make_collect_task, make_recipes, make_task, never_built
 
-from cluster.workers import address, ray_pool
-from cluster.workers.pool import Call, Outcome, PoolError
+from cluster.workers.address import cluster_address
+from cluster.workers.open import open_pool
+from cluster.workers.pool import Call, Collected, Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.threads import ThreadPool
-from cluster.workers.worker import CollectTask, Worker
+from cluster.workers.worker import CollectTask
 
 pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 KILLED = "its process was killed, crashed, or ran out of memory"
@@ -35,8 +36,8 @@ class Obeying(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def answer(self, task, maps, recipes, first, stop):
-        rows = task.keys[first:stop] if isinstance(task, CollectTask) else recipes["seed"]
+    def answer(self, task, maps, recipes, columns):
+        rows = task.keys[columns] if isinstance(task, CollectTask) else recipes["seed"]
         for path in sorted(self._folder.glob("*-*")):
             what, row = path.name.split("-")
             times = int(path.read_text())
@@ -44,24 +45,8 @@ class Obeying(Answering):
                 mine = self._folder / str(os.getpid())
                 mine.write_text(str(times - 1))
                 mine.replace(path)  # at once: another worker may read it just now
-                if what == "raise":
-                    raise ValueError("that member\nis not to be had")
                 os.kill(os.getpid(), signal.SIGKILL if what == "kill" else signal.SIGSTOP)
-        return super().answer(task, maps, recipes, first, stop)
-
-
-class Inspecting(Worker):
-    """Fails where something is wrong with its process or its inputs."""
-
-    def evaluate(self, task, maps, recipes):
-        for array in (task.parents, task.episodes, recipes, *(each.road.field for each in maps)):
-            assert array.flags.aligned
-        assert not any(each.road.field.flags.writeable for each in maps), "they are copies"
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN, "Ctrl-C would reach a worker"
-        assert os.environ.get("OMP_NUM_THREADS") == "1", "a worker has more than one thread"
-        assert os.nice(0) == 0, "busy programs would starve it"
-        assert psutil.Process().memory_full_info().uss <= 220 << 20
-        return super().evaluate(task, maps, recipes)
+        return super().answer(task, maps, recipes, columns)
 
 
 @pytest.fixture(scope="module")
@@ -70,78 +55,55 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def held() -> Iterator[list[RayPool]]:
-    """The pool that is shared by tests, or none. There can only be one in a process."""
-    pools: list[RayPool] = []
-    yield pools
-    for pool in pools:
-        pool.close()
+def only_pool(folder: Path, stand_ins: None) -> Iterator[RayPool]:
+    """One for all tests, as there can only be one in a process, and a start takes seconds."""
+    with contextlib.closing(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder))) as pool:
+        pool.open()
+        yield pool
 
 
 @pytest.fixture
-def pool(held: list[RayPool], folder: Path) -> RayPool:
-    """One pool for many tests (a start takes seconds), both of its workers up and without orders."""
+def pool(only_pool: RayPool, folder: Path) -> RayPool:
+    """A pool whose workers are both up and without orders."""
     for path in folder.iterdir():
         path.unlink()
-    if not held:
-        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)))
-        held[0].open()
-    wait_until(lambda: held[0].evaluate(make_task(), make_recipes(512)) and len(held[0].pids()) == 2)
-    return held[0]
+    wait_until(lambda: goes_on(only_pool) and len(only_pool.pids()) == 2)
+    return only_pool
 
 
-@pytest.fixture
-def no_pool(held: list[RayPool]) -> None:
-    """For tests that bring their own."""
-    while held:
-        held.pop().close()
-
-
-def expected(n: int) -> bytes:
-    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as pool:
-        return pool.evaluate(make_task(), make_recipes(n)).results.tobytes()
-
-
-def test_what_is_sent_is_counted(pool: RayPool) -> None:
-    outcome = pool.evaluate(make_task(), make_recipes(512))
-    assert outcome.bytes_down == outcome.recipes.nbytes
-    assert outcome.results.nbytes < outcome.bytes_up < outcome.results.nbytes + 20_000
-    assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
-    assert set(outcome.busy_s) == {0, 1}
+def goes_on(pool: RayPool) -> bool:
+    """Whether a pool can be used again, with the results of threads."""
+    outcome = Outcome(make_task(), make_recipes(512))
+    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
+        wanted = threads.run(Outcome(make_task(), make_recipes(512)))
+    return pool.run(outcome).results.tobytes() == wanted.results.tobytes()
 
 
 @pytest.mark.parametrize("what", ["kill", "stop"])
-@pytest.mark.parametrize("calls", ["evaluate", "collect"])
+@pytest.mark.parametrize("kind", [Outcome, Collected])
 def test_what_a_lost_worker_held_is_done_by_another(
-    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str, calls: str
+    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str, kind: type[Call]
 ) -> None:
     """One that is killed, or that is stopped, as by a host that is cut off, of which Ray says nothing."""
     monkeypatch.setattr(pool, "_silence_s", 2.0)
-    before, pid = set(pool.pids()), 0
+    asked = (make_task(), make_recipes(512)) if kind is Outcome else (make_collect_task(400),)
+    before = set(pool.pids())
     (folder / f"{what}-30").write_text("1")
-    if calls == "evaluate":
-        call: Call = (driven := pool.evaluate(make_task(), make_recipes(512)))
-        assert driven.results.tobytes() == expected(512)
-    else:
-        call = collected = pool.collect(make_collect_task(400))
-        with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
-            assert to_bytes(collected.experience) == to_bytes(threads.collect(make_collect_task(400)).experience)
+    call = pool.run(kind(*asked))
+    with contextlib.closing(ThreadPool(never_built, 1, Answering)) as threads:
+        wanted = threads.run(kind(*asked))
+    assert call.results.tobytes() == wanted.results.tobytes()
+    if isinstance(call, Collected) and isinstance(wanted, Collected):
+        assert to_bytes(call.experience) == to_bytes(wanted.experience)
     (said,) = call.warnings
     reason = KILLED if what == "kill" else r"it did not answer for \d+ s \(--patience\)"
     assert re.fullmatch(f"a worker is replaced: {reason}", said)
-    assert 1 <= call.retries <= ray_pool.QUEUED
-    wait_until(lambda: pool.evaluate(make_task(), make_recipes(64)) and len(pool.pids()) == 2)
+    wait_until(lambda: goes_on(pool) and len(pool.pids()) == 2)
     (pid,) = before - set(pool.pids())
     wait_until(lambda: not psutil.pid_exists(pid), 30)
-
-
-def test_a_worker_that_had_nothing_to_do_for_longer_than_patience_is_kept(
-    pool: RayPool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pool, "_silence_s", 1.0)
     pids = pool.pids()
-    time.sleep(1.5)
-    assert pool.evaluate(make_task(), make_recipes(512)).warnings == []
+    time.sleep(2.5)
+    assert pool.run(Outcome(make_task(), make_recipes(512))).warnings == [], "it only had nothing to do"
     assert pool.pids() == pids
 
 
@@ -152,26 +114,13 @@ def test_three_deaths_over_one_piece_end_the_run_in_one_line(pool: RayPool, fold
         rf"0x3039\)\); the last time {KILLED}"
     )
     with pytest.raises(PoolError) as caught:
-        pool.evaluate(make_task(), make_recipes(512))
+        pool.run(Outcome(make_task(), make_recipes(512)))
     found = re.fullmatch(line, str(caught.value))
     assert found, caught.value
     assert int(found[1]) <= 300 <= int(found[2])
     assert (folder / "kill-300").read_text() == "6"
     (folder / "kill-300").unlink()
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
-
-
-def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path) -> None:
-    (folder / "raise-100").write_text("9")
-    with pytest.raises(PoolError, match=r"^a worker failed on members \d+ to \d+: ValueError: is not to be had\Z"):
-        pool.evaluate(make_task(), make_recipes(512))
-    (folder / "raise-100").unlink()
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
-
-
-def test_answers_to_a_call_that_was_left_do_not_count_for_the_next(pool: RayPool) -> None:
-    pool.start(Outcome(make_task(), make_recipes(512)[::-1]))
-    assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+    assert goes_on(pool)
 
 
 def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,51 +132,14 @@ def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(ray, "wait", fail)
         with pytest.raises(PoolError, match=r"^Ray failed: .*is gone$"):
-            pool.evaluate(make_task(), make_recipes(512))
-    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+            pool.run(Outcome(make_task(), make_recipes(512)))
+    assert goes_on(pool)
 
 
-def test_only_one_pool_at_a_time(pool: RayPool) -> None:
-    second = RayPool(1, never_built)
-    with contextlib.closing(pool), pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or .*\(workers=0\)$"):
-        second.open()
-
-
-def test_maps_that_are_not_used_are_forgotten_where_there_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_pool, "MOST_MAPS", 3)
-    maps = dict.fromkeys([("city", seed) for seed in range(4)])
-    for _ in range(2):
-        ray_pool.bounded(maps, [("city", 1), ("city", 3)])
-        assert list(maps) == [("city", 1), ("city", 3)]
-        ray_pool.bounded(maps, [("city", 7)])  # two are not many
-
-
-@pytest.mark.usefixtures("no_pool")
-def test_workers_are_as_they_should_be_and_end_with_the_pool() -> None:
-    (task, maps), recipes, collecting = drive_task(), make_recipes(200), collect_drive_task(100)
-    with contextlib.closing(RayPool(2, lambda _, seed: maps[seed], worker_factory=Inspecting)) as pool:
-        pool.open()
-        first = pool.evaluate(task, recipes)
-        assert first.results.tobytes() == Worker().evaluate(task, maps, recipes)[0].tobytes()
-        assert first.broadcast_bytes > sum(each.nbytes for each in maps)
-        killer = threading.Timer(0.001, os.kill, (pool.pids()[-1], signal.SIGKILL))
-        killer.start()
-        for _ in range(2):
-            wanted, _ = Worker().collect(collecting, maps)
-            assert to_bytes(pool.collect(collecting).experience) == to_bytes(wanted)
-        killer.join()
-        processes = psutil.Process().children(recursive=True)
-    assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
-
-
-@pytest.mark.usefixtures("no_pool")
-def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_pool, "MAX_DEATHS", 3)
-    with (
-        contextlib.closing(RayPool(1, never_built, worker_factory=Obeying)) as pool,  # type: ignore[arg-type]
-        pytest.raises(PoolError, match=r"^workers keep dying \(4 in a row\); the last time TypeError: .*'folder'$"),
-    ):
-        pool.open()
+def test_a_ray_that_is_in_use_is_left_alone(pool: RayPool) -> None:
+    with pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or .*\(workers=0\)$"):
+        open_pool(1, None, 0.0, never_built)
+    assert goes_on(pool)
 
 
 # --- Clusters, which are joined by processes of their own: Ray reads a token once -------------------------------------
@@ -235,21 +147,21 @@ def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.M
 JOIN = """
 import sys, time
 from test_pool import make_recipes, make_task, never_built, Answering
-from cluster.workers.pool import PoolError
+from cluster.workers.pool import Outcome, PoolError
 from cluster.workers.ray_pool import RayPool
 
 for address in sys.argv[3:]:
     pool = RayPool(int(sys.argv[1]), never_built, address, float(sys.argv[2]), Answering)
     try:
         pool.open()
-        print(pool.workers, pool.evaluate(make_task(), make_recipes(8)).done)
+        print(pool.workers, pool.run(Outcome(make_task(), make_recipes(8))).done)
     except PoolError as error:
         print(error)
     pool.close()
 """
 
 
-def join(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.0, **environment: Any) -> list[str]:
+def joined(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.0, **environment: Any) -> list[str]:
     """What a pool says, of each address."""
     done = finish("python", "-c", JOIN, str(workers), str(patience_s), *addresses, cwd=tmp_path, **environment)
     assert done.stderr == ""
@@ -259,19 +171,18 @@ def join(tmp_path: Path, workers: int, *addresses: str, patience_s: float = 100.
 def test_a_cluster_is_joined_with_its_token_and_all_of_its_free_cpus(cluster: Callable, tmp_path: Path) -> None:
     token: dict[str, Any] = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "ab" * 32}
     at, _ = cluster(3, **token)
-    assert join(tmp_path, 0, at, **token) == ["3 16"]
-    assert join(tmp_path, 2, at, **token) == ["2 16"], "the run before has left"
-    assert join(tmp_path, 2, at) == [
+    assert joined(tmp_path, 0, at, **token) == ["3 16"]
+    assert joined(tmp_path, 2, at, **token) == ["2 16"], "the run before has left"
+    assert joined(tmp_path, 2, at) == [
         f"could not join the Ray cluster at {at}: it wants its token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "
         "its head's `ray get-auth-token`"
     ]
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_cluster_without_free_cpus_is_waited_for_and_named(cluster: Callable, tmp_path: Path, workers: int) -> None:
+def test_a_cluster_without_free_cpus_is_waited_for_and_named(cluster: Callable, tmp_path: Path) -> None:
     at, _ = cluster(0)
     wanted = "there has been no worker for 6 s (--patience): Ray has 0 CPUs, 0 of them free, and a worker needs 1"
-    assert join(tmp_path, workers, at, patience_s=6.0) == [wanted]
+    assert [joined(tmp_path, workers, at, patience_s=6.0) for workers in (0, 2)] == [[wanted], [wanted]]
 
 
 def test_what_answers_something_else_or_says_nothing_is_no_cluster(tmp_path: Path) -> None:
@@ -280,7 +191,7 @@ def test_what_answers_something_else_or_says_nothing_is_no_cluster(tmp_path: Pat
         threading.Thread(target=other.serve_forever, daemon=True).start()
         started = time.perf_counter()
         addresses = [f"127.0.0.1:{port}" for port in (other.server_port, silent.getsockname()[1])]
-        assert join(tmp_path, 2, *addresses) == [
+        assert joined(tmp_path, 2, *addresses) == [
             f"could not join the Ray cluster at {at}: what answers there is not a Ray cluster; is that its head's port?"
             for at in addresses
         ]
@@ -291,31 +202,30 @@ def test_what_answers_something_else_or_says_nothing_is_no_cluster(tmp_path: Pat
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        *((text, "is not a Ray address; give") for text in ("nowhere", "host:99999", ":6379", "ray://a:10001")),
-        ("127.0.0.1:1", r"^no Ray cluster answers at 127.0.0.1:1: Connection refused; is `ray start"),
+        *(
+            (text, "is not a Ray address; give")
+            for text in ("nowhere", "host:99999", ":6379", "ray://u:secret@a:10001")
+        ),
+        ("127.0.0.1:1", "no Ray cluster answers at 127.0.0.1:1: Connection refused; is `ray start"),
     ],
 )
-def test_an_address_where_there_is_no_cluster_is_refused_at_once(given: str, said: str) -> None:
-    with pytest.raises(PoolError, match=said):
-        address.check_address(given)
-
-
-@pytest.mark.parametrize("given", ["", "auto"])
-@pytest.mark.parametrize("variable", ["ray://u:secret@127.0.0.1:10001", "127.0.0.1:1"])
-def test_an_address_from_the_environment_is_refused_with_the_variables_name(
-    given: str, variable: str, monkeypatch: pytest.MonkeyPatch
+def test_an_address_where_there_is_no_cluster_is_refused_at_once(
+    given: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", variable)
-    with pytest.raises(PoolError, match=r" \(RAY_ADDRESS says so; unset it, or give --address local\)$") as caught:
-        address.cluster_address(given)
+    with pytest.raises(PoolError, match=said) as caught:
+        cluster_address(given)
     assert "secret" not in str(caught.value)
+    monkeypatch.setenv("RAY_ADDRESS", given)
+    for automatic in ("", "auto"):
+        with pytest.raises(PoolError, match=rf"{said}.* \(RAY_ADDRESS says so; unset it, or give --address local\)$"):
+            cluster_address(automatic)
 
 
 def test_the_address_of_rays_jobs_is_left_out_and_local_means_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert address.cluster_address("auto") == "auto"
+    assert cluster_address("auto") == "auto"
     monkeypatch.setenv("RAY_ADDRESS", "http://u:secret@127.0.0.1:8265")
     with pytest.warns(UserWarning, match=r"^RAY_ADDRESS=http://127.0.0.1:8265 is where Ray takes jobs, so this run"):
-        assert address.cluster_address("") is None
-    assert address.cluster_address("local") is None
+        assert cluster_address("") is None
+    assert cluster_address("local") is None
     monkeypatch.setenv("RAY_ADDRESS", "local")
-    assert [address.cluster_address(given) for given in ("", "auto")] == [None, None]
+    assert [cluster_address(given) for given in ("", "auto")] == [None, None]

@@ -7,25 +7,23 @@ end, however that is, it ends too, and the kernel removes the host's processes, 
 import os
 import pwd
 import shutil
+import site
 import subprocess
 import sys
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 from typing import Any
 
 from commands import command_line, descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
-PROGRAMS = {
-    "util-linux": ("unshare", "nsenter"),
-    "iproute2": ("ip", "ss"),
-    "openssh-server": ("sshd",),
-    "openssh-client": ("ssh", "ssh-keygen"),
-    "rsync": ("rsync",),
-    "procps": ("uptime",),  # `ray up` asks with it whether a host is there
-}
-UNSHARE = ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc"]
+PROGRAMS = ("unshare", "nsenter", "ip", "ss", "sshd", "ssh", "ssh-keygen", "rsync", "uptime")  # `ray up` calls the last
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
+# What a shell starts with on a host.
+ENVIRONMENT = {"HOME": str(HOME), "PATH": SEARCH, "LANG": "C.UTF-8", "TERM": "dumb", "RAY_USAGE_STATS_ENABLED": "0"}
+UNSHARE = ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc"]
 
 # Arguments: the host's folder, the home to replace, what to keep (up to --), what to hide.
 SETUP = """
@@ -55,24 +53,23 @@ def missing() -> str:
     """Why there can be no hosts here; empty where there can."""
     if os.geteuid() != 0:
         return "needs root, for network namespaces"
-    if packages := [name for name in PROGRAMS if not all(shutil.which(each, path=SEARCH) for each in PROGRAMS[name])]:
-        return f"needs apt-get install {' '.join(packages)}"
+    if lacking := [name for name in PROGRAMS if not shutil.which(name, path=SEARCH)]:
+        return f"needs {', '.join(lacking)}"
     done = subprocess.run([*UNSHARE, "true"], capture_output=True)
     return "" if done.returncode == 0 else "needs leave to make namespaces (in Docker: --privileged)"
 
 
 def package_folders() -> set[str]:
-    """Where a Python started anywhere finds this project, and where we do."""
-    names = ("cluster", "evolution", "gridsim")
-    code = f"import importlib.util as u; [print(*u.find_spec(n).submodule_search_locations) for n in {names}]"
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    installed = subprocess.run([sys.executable, "-c", code], cwd="/", env=environment, capture_output=True, text=True)
-    return {*(str(Path(__file__).parents[2] / name) for name in names), *installed.stdout.split()}
+    """Where this project's packages are found: in the checkout, and where they are installed."""
+    places = [Path(__file__).parents[2], *map(Path, site.getsitepackages())]
+    folders = [place / name for place in places for name in ("cluster", "evolution", "gridsim")]
+    return {str(folder) for folder in folders if folder.exists()}
 
 
+@dataclass
 class Command:
-    def __init__(self, process: subprocess.Popen[bytes], log: Path):
-        self.process, self.log = process, log
+    process: subprocess.Popen[bytes]
+    log: Path
 
     def finish(self, timeout: float, code: int = 0) -> str:
         """Wait for its end, which has to be with that exit code; returns its output, errors included."""
@@ -107,34 +104,24 @@ class Host:
         arguments = [folder, HOME, *keep, folder, "--", *sorted(hide)]
         self._process = subprocess.Popen(
             [*UNSHARE, "--uts", "--kill-child", "bash", "-c", SETUP, "host", *map(str, arguments)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=self.environment(),
-        )
-        assert self._process.stdout is not None
-        said = [line := self._process.stdout.readline()]
-        while line not in (b"ready\n", b""):
-            said.append(line := self._process.stdout.readline())
+            stdin=PIPE, stdout=PIPE, stderr=STDOUT, env=ENVIRONMENT,
+        )  # fmt: skip
+        assert self._process.stdout
+        said = list[bytes]()
+        while (line := self._process.stdout.readline()) not in (b"ready\n", b""):
+            said.append(line)
         assert line, f"the host could not be set up: {b''.join(said).decode()}"
         self.pid = descendants(self._process.pid)[0]
 
-    @staticmethod
-    def environment() -> dict[str, str]:
-        """What a shell starts with there."""
-        return {"HOME": str(HOME), "PATH": SEARCH, "LANG": "C.UTF-8", "TERM": "dumb", "RAY_USAGE_STATS_ENABLED": "0"}
-
-    def start(self, *command: object, cwd: object = HOME, **environment: str) -> "Command":
+    def start(self, *command: object, cwd: object = HOME, **environment: str) -> Command:
+        """A command there; keywords are set in its environment."""
         self._logs += 1
         log = self.folder / "logs" / f"{self._logs}"
         shell = ["bash", "-c", 'cd "$1" && shift && exec "$@"', "shell", cwd, *command]
+        entered = [*self._enter("--pid", "--mount", "--uts"), *map(str, shell)]
         with log.open("wb") as output:
             process = subprocess.Popen(
-                [*self._enter("--pid", "--mount", "--uts"), *map(str, shell)],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=self.environment() | environment,
+                entered, stdin=subprocess.DEVNULL, stdout=output, stderr=STDOUT, env=ENVIRONMENT | environment
             )
         return Command(process, log)
 
