@@ -10,7 +10,7 @@ import pytest
 from finished_runs import make_run
 
 from cluster.commands.cli import DqnFlags, EvolveFlags
-from cluster.commands.common import parse, select
+from cluster.commands.common import parse
 from cluster.compare.plan import UNLIMITED, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.compare.results import LEARNERS
 from cluster.compare.tables import group
@@ -127,8 +127,8 @@ def test_the_flags_of_a_run_give_its_settings(plan):
     for run in plan.planned(Path("runs/c")):
         kind: Any = EvolveFlags if run.settings.command == "gridsim-evolve" else DqnFlags
         flags = parse(kind, run.settings.command, run.flags())
-        assert select(type(run.settings), flags) == run.settings
-        assert (flags.output, flags.name) == ("runs/c", run.name)
+        assert flags.learning == run.settings
+        assert (flags.work.output, flags.run.name) == ("runs/c", run.name)
 
 
 @pytest.mark.parametrize(
