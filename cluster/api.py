@@ -16,7 +16,7 @@ from cluster.learn.evolution import Evolution
 from cluster.learn.learning import finish
 from cluster.learn.maps import Maps
 from cluster.run import new_learning
-from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.store.champion import Champion, evaluate, load_champion
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
@@ -91,6 +91,7 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
     settings.check()
+    check_workers(workers, 0.0)
     maps = Maps(settings.scenario, SimConfig())
     pool: WorkerPool | None = None
     try:

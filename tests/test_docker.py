@@ -92,7 +92,7 @@ def test_it_runs_as_a_user_whose_caches_and_volumes_are_its_own() -> None:
     folders = set(owned.split())
     (cache,) = re.findall(r"GRIDSIM_CACHE_DIR=(\S+)", text)
     assert cache in folders
-    assert f"{last['WORKDIR']}/{cli.EvolveFlags().output}" in folders, "where runs go by default"
+    assert f"{last['WORKDIR']}/{common.WorkFlags().output}" in folders, "where runs go by default"
     volumes = [volume for service in compose()["services"].values() for volume in service.get("volumes", [])]
     assert {volume.split(":")[1] for volume in volumes} <= folders, "a new volume has its folder's owner"
     assert {volume.split(":")[0] for volume in volumes} == set(compose()["volumes"])

@@ -7,13 +7,12 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import tyro
 from rich.console import Console
 
@@ -29,7 +28,6 @@ from cluster.commands.common import (
     main,
     new_console,
     parse,
-    select,
     short_path,
     warn_of_many_workers,
 )
@@ -41,8 +39,8 @@ from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.stopping import INTERRUPTED
 from cluster.store.champion import evaluate, load_champion
-from cluster.store.checkpoint import CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError
-from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run, read_config, write_summary
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError
+from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config, write_summary
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
@@ -73,28 +71,21 @@ class RunFlags:
 
 
 @dataclass(frozen=True)
-class EvolveFlags(RunFlags, WorkFlags, EvolveSettings):
+class EvolveFlags:
     """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
     curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
-    groups: ClassVar[dict[str, type]] = {"learning": EvolveSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1"
-    #: Flags of version 0.1, and what replaces them.
-    removed: ClassVar[dict[str, str]] = {
-        "--islands": "a run has one population; use --recombination all, the default, which needs no islands",
-        "--island-car-steps": "a run has one population; use --car-steps for its budget",
-        "--parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
-        "--crossover": "all children of --recombination two have two parents; use --recombination",
-        "--bump-rate": "mutation is Gaussian; use --sigma for its size",
-        "--ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
-    }
+    learning: EvolveSettings
+    work: WorkFlags
+    run: RunFlags
 
 
 @dataclass(frozen=True)
-class DqnFlags(RunFlags, WorkFlags, DqnSettings):
+class DqnFlags:
     """Train a driver by deep Q-learning: workers collect experience while the learner trains on what they collected.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
@@ -102,17 +93,17 @@ class DqnFlags(RunFlags, WorkFlags, DqnSettings):
     depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
-    groups: ClassVar[dict[str, type]] = {"learning": DqnSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1"
-    #: Flags of version 0.2, and why they were removed.
-    removed: ClassVar[dict[str, str]] = {
-        **dict.fromkeys(("--prioritised", "--no-prioritised"), "transitions are drawn uniformly, which does as well"),
-        **dict.fromkeys(("--double", "--no-double"), "the DQN is always a double DQN"),
-        "--n-step": "targets have one step of rewards; more gained nothing",
-    }
+    learning: DqnSettings
+    work: WorkFlags
+    run: RunFlags
 
 
 Flags = EvolveFlags | DqnFlags
+FLAGS: dict[str, Any] = {EvolveSettings.command: EvolveFlags, DqnSettings.command: DqnFlags}
+# Flags that may differ when a run is resumed: where it is computed and logged, and how it is found.
+MAY_DIFFER = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
+MAY_DIFFER |= {"resume", "resume_if_exists", "config", "wall_time"}
 
 
 @dataclass(frozen=True)
@@ -129,150 +120,131 @@ class EvaluateFlags(RoadFlags):
     """Print one JSON object and nothing else."""
 
     example: ClassVar[str] = "gridsim-evaluate runs/NAME --scenario city --episodes 500"
-    removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; use --errors"}
 
 
-def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
+def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises GridSimError."""
-    prog = kind.command
-    flags = parse(kind, prog, arguments)
+    kind = FLAGS[prog]
+    flags, run, base = parse(kind, prog, arguments), None, None
     resume = _folder_to_resume(flags)
-    base: Flags | None = None
-    if resume or flags.config:  # the settings of that run are the defaults
+    if source := resume or flags.run.config:  # the settings of that run are the defaults
         if resume:
             run = open_run(Path(resume))
-            settings, init = run.settings, run.init
+            settings, start = run.settings, RunFlags(name=run.name, init=run.init)
         else:
-            settings, init = read_config(Path(flags.config))
+            settings, init = read_config(Path(source))
+            start = RunFlags(init=init)
         if settings.command != prog:
-            flag, path = ("--resume", resume) if resume else ("--config", flags.config)
-            again = f"{settings.command} {flag} {as_argument(Path(path))}"
-            raise GridSimError(f"{path} belongs to another learner; use {again}")
-        base = kind(**dataclasses.asdict(settings), init=init)
-        if resume:
-            base = dataclasses.replace(base, resume=flags.resume, output=str(run.path.parent), name=run.name)
+            again = f"{settings.command} {'--resume' if resume else '--config'} {as_argument(Path(source))}"
+            raise GridSimError(f"{source} belongs to another learner; use {again}")
+        base = kind(settings, WorkFlags(output=str(run.path.parent)) if run else WorkFlags(), start)
         flags = parse(kind, prog, arguments, base)
-    if flags.traffic and is_map_file(flags.scenario):
-        print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
-        return _prepare(kind, [*arguments, "--traffic", "0"])
-    check_workers(flags.workers, flags.patience)
-    if not 0.0 <= flags.wall_time < math.inf:
-        raise GridSimError(f"--wall-time must be 0 or more, not {flags.wall_time:g}")
-    if base and resume:
-        flags = flags.extending(base)
-        free = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"} | {"resume_if_exists", "wall_time"}
-        check_unchanged(flags, base, free, kind.extendable, "run")
-    settings = select(EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings, flags)
+    settings = flags.learning
+    if settings.traffic and is_map_file(settings.scenario):
+        print(f"{prog}: {settings.scenario} has no lanes for traffic; running without", file=sys.stderr)
+        return _prepare(prog, [*arguments, "--traffic", "0"])
+    check_workers(flags.work.workers, flags.work.patience)
+    if not 0.0 <= flags.run.wall_time < math.inf:
+        raise GridSimError(f"--wall-time must be 0 or more, not {flags.run.wall_time:g}")
+    if run and base:
+        settings = settings.extending(run.settings)
+        check_unchanged(settings, run.settings, (), settings.extendable, "run")
+        check_unchanged(flags.work, base.work, MAY_DIFFER, (), "run")
+        check_unchanged(flags.run, base.run, MAY_DIFFER, (), "run")
     settings.check()
-    if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        _check_cuda(resume)
-    if resume:
+    if isinstance(settings, DqnSettings) and settings.device == "cuda":
+        from evolution.dqn.learner import device_of  # imports PyTorch
+
+        device_of("cuda")  # raises GridSimError if there is none
+    if run:
         run.settings = settings
         return flags, run
     digest = ""
-    if flags.init:
-        champion = load_champion(flags.init)
-        if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
-            raise GridSimError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
-        if not np.isfinite(champion.genome).all():
-            raise GridSimError(f"--init {flags.init}: some of its genes are not numbers; choose another champion")
+    if init := flags.run.init:
+        champion = load_champion(init)
+        if champion.policy != str(PolicySpec.parse(settings.policy)):
+            raise GridSimError(f"--init {init} is a {champion.policy}; use --policy {champion.policy}")
         digest = champion.sha256
-    output = Path(flags.output)
-    return flags, new_run(output, flags.name, settings, flags.init, digest, may_exist=flags.resume_if_exists)
+    place = Path(flags.work.output), flags.run.name
+    return flags, new_run(*place, settings, init, digest, may_exist=flags.run.resume_if_exists)
 
 
 def _folder_to_resume(flags: Flags) -> str:
     """The folder of the run that these flags continue, or "" for a new run. Raises GridSimError."""
-    if not flags.resume_if_exists:
-        if flags.resume and flags.config:
+    given = flags.run
+    if not given.resume_if_exists:
+        if given.resume and given.config:
             text = "--resume and --config exclude each other: --resume continues a run, --config repeats it"
             raise GridSimError(text)
-        return flags.resume
-    if flags.resume or not flags.name:
+        return given.resume
+    if given.resume or not given.name:
         raise GridSimError("--resume-if-exists starts or continues the run of a --name; give that, and no --resume")
-    path = Path(flags.output, flags.name)
+    path = Path(flags.work.output, given.name)
     return str(path) if (path / CHECKPOINT).is_file() else ""
 
 
-def _check_cuda(resume: str) -> None:
-    """Raises GridSimError if there is no GPU."""
-    from evolution.dqn.learner import device_of  # imports PyTorch
-
-    try:
-        device_of("cuda")
-    except ValueError as error:
-        there = f"{resume} was trained with --device cuda, and PyTorch finds no GPU; continue it where there is one"
-        raise GridSimError(there if resume else f"--device cuda: {error}") from error
-
-
-def _learn(kind: type[Flags]) -> int:
-    prog, step = kind.command, kind.step_name
+def _learn(prog: str) -> int:
     console = new_console()
-    flags, run = _prepare(kind, sys.argv[1:])
-    settings, folder = run.settings, short_path(run.path)
+    flags, run = _prepare(prog, sys.argv[1:])
+    settings, work, folder = run.settings, flags.work, short_path(run.path)
     if run.saved and is_finished(run):
-        return _send_missing(console, run, flags)
+        return _send_missing(console, run, run.saved[1], work)
     place = Place(
-        flags.workers,
-        cluster_address(flags.address),
-        flags.patience,
-        check_uri(flags.tracking_uri, saved_uri(run.path)),
-        flags.experiment,
-        flags.wall_time or math.inf,
+        work.workers,
+        cluster_address(work.address),
+        work.patience,
+        check_uri(work.tracking_uri, saved_uri(run.path)),
+        work.experiment,
+        flags.run.wall_time or math.inf,
     )
     warn_of_many_workers(prog, place.workers, place.address)
-    new_folders = [path for path in (run.path, *run.path.parents) if not path.exists()]
     lock(run.path)
     if run.saved is None and (run.path / CHECKPOINT).exists():
         raise GridSimError(f"{folder}: another process has just begun this run; start the command again to continue it")
     stopping.listen()
     resume = f"{command_path(prog)} --resume {folder}"
     hint = f"continue with: {resume}"
-    verb = "continuing" if run.saved else kind.verb
+    verb = "continuing" if run.saved else settings.verb
     console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}", soft_wrap=True)
-    code, message = 0, ""
     try:
-        initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
+        initial = load_champion(run.init).genome if run.init and run.saved is None else None
         with RunDisplay(console, settings) as shown:
             session = train(run, place, shown.event, shown.row, initial=initial, started=STARTED)
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
-        code = INTERRUPTED
+        problem = ""
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
-        code, message = FAILED, str(error) or type(error).__name__
+        problem = str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # if resumed, it would fail again
             hint = f"repeat it with: {command_path(prog)} --config {short_path(run.path / CONFIG)} --learning-rate ..."
-    if code == 0:
+    else:
         _print_end(console, session, resume)
-        return code
-    resumable = (run.path / CHECKPOINT).is_file()
-    if not resumable:
+        return 0
+    if not (run.path / CHECKPOINT).is_file():
+        hint = ""
         with contextlib.suppress(OSError):
             for name in (CONFIG, STEPS):
                 (run.path / name).unlink(missing_ok=True)
-            for path in new_folders:
-                path.rmdir()
-    if code == FAILED:
-        fail(prog, message, hint if resumable else "", FAILED)
-    print(f"{prog}: stopped; {hint if resumable else f'no {step} was done yet'}", file=sys.stderr)
-    return code
+            run.path.rmdir()
+    if problem:
+        fail(prog, problem, hint, FAILED)
+    print(f"{prog}: stopped; {hint or f'no {settings.step_name} was done yet'}", file=sys.stderr)
+    return INTERRUPTED
 
 
-def _send_missing(console: Console, run: RunFolder, flags: Flags) -> int:
+def _send_missing(console: Console, run: RunFolder, meta: Mapping[str, Any], work: WorkFlags) -> int:
     """Send to MLflow what it lacks of a finished run, and say how to go on."""
-    settings, saved = run.settings, run.saved
-    assert saved is not None
-    meta = saved[1]
-    sent, unsent = sync(run.path, flags.tracking_uri, flags.experiment, read_run)
+    settings = run.settings
+    sent, unsent = sync(run.path, work.tracking_uri, work.experiment, read_run)
     if sent:  # perhaps MLflow was away as the run ended
         summary = json.loads((run.path / SUMMARY).read_bytes())
         write_summary(run.path, summary | {"mlflow_run_id": saved_run_id(run.path)})
-    sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
+    done = f"sent to MLflow: {sent}" if sent else "nothing to do"
     limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
     more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""
     if meta["solved"]:
         more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
     steps = count(meta[settings.step_name], settings.step_name)
-    console.print(f"{short_path(run.path)} is finished: {steps}; {sent}.{more}", soft_wrap=True)
+    console.print(f"{short_path(run.path)} is finished: {steps}; {done}.{more}", soft_wrap=True)
     if unsent:
         print(f"{settings.command}: warning: {unsent}", file=sys.stderr)
     return 0
@@ -280,22 +252,21 @@ def _send_missing(console: Console, run: RunFolder, flags: Flags) -> int:
 
 def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
-    summary, name, path = session.summary, session.run.settings.step_name, session.run.path
-    settings = session.run.settings
+    summary, settings, path = session.summary, session.run.settings, session.run.path
     where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
-    steps, solved = count(summary[name + "s"], name), summary["solved"]
-    reached = [each for each in settings.extendable if 0 < getattr(settings, each) <= summary[each]]
-    longer = " ".join(f"{as_flag(each)} {2 * summary[each]}" for each in reached)
-    more = "" if solved or not longer else f"\nto go on: {resume} {longer}"
+    steps, solved = count(summary[f"{settings.step_name}s"], settings.step_name), summary["solved"]
+    reached = [name for name in settings.extendable if 0 < getattr(settings, name) <= summary[name]]
+    longer = " ".join(f"{as_flag(name)} {2 * summary[name]}" for name in reached)
+    more = f"\nto go on: {resume} {longer}" if longer and not solved else ""
     console.print(
         f"{'solved' if solved else 'not solved yet'} after {steps}, {summary['car_steps']:,} car-steps, "
         f"{summary['wall_s']:.0f} s{more}\n"
         f"success in validation{', on which the champion was chosen' if solved else ' at the end'}: "
         f"{summary['validation_success_rate']:.1%} "
         "(in MLflow validation/success_rate; the table's is held_out/success_rate)\n"
-        f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
-        f"watch it: open {short_path(path / 'drive.html')} in a browser, or "
+        f"run: {short_path(path)}   champion: {short_path(path / CHAMPION)}\n"
+        f"watch it: open {short_path(path / PAGE)} in a browser, or "
         f"{command_path('gridsim-watch')} {short_path(path)}\n"
         f"compare: {session.tracking.where(command_path('mlflow'))}",
         soft_wrap=True,
@@ -321,6 +292,5 @@ def _evaluate() -> int:
     return 0
 
 
-evolve_main = partial(main, EvolveFlags.command, partial(_learn, EvolveFlags))
-dqn_main = partial(main, DqnFlags.command, partial(_learn, DqnFlags))
+evolve_main, dqn_main = (partial(main, prog, partial(_learn, prog)) for prog in FLAGS)
 evaluate_main = partial(main, "gridsim-evaluate", _evaluate, {CheckpointError: "give a run's folder or a champion.npz"})

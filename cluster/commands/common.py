@@ -13,11 +13,10 @@ import re
 import shutil
 import sys
 import textwrap
-import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
 from docstring_parser import attrdoc
@@ -34,12 +33,6 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 T = TypeVar("T")
 FAILED, WRONG_USE = 1, 2  # exit codes
 MANY_WORKERS = 4  # per core; more cause a warning
-# Patterns of tyro's messages about wrong flags, and what the user reads instead.
-PLAIN = {
-    r"Error parsing (?=--)": "",
-    r"could not convert string to float: ('[^']*')": r"\1 is not a number",
-    r"Missing from \S+: (\S+) ([^()]*) \(required\)": r"\1 is missing: \2",
-}
 
 # tyro wraps a field's docstring as one paragraph only if its lines are not indented. It has no setting for this, and no
 # other part of a command reads docstrings.
@@ -65,13 +58,7 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
                 return int(number)
         raise ValueError(f"'{words[0]}' is not a whole number")
 
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="INT",
-        instance_from_str=read,
-        is_instance=lambda x: isinstance(x, int),
-        str_from_instance=lambda x: [str(x)],
-    )
+    return tyro.constructors.PrimitiveConstructorSpec(1, "INT", read, lambda x: isinstance(x, int), lambda x: [str(x)])
 
 
 @dataclass(frozen=True)
@@ -107,63 +94,48 @@ class RoadFlags:
 
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
     """Parse the command line. Exits with 0 after --help, and with 2 and one clear line for wrong use."""
-    _check_flags(kind, prog, arguments)
+    see, known = f"see {command_path(prog)} --help", [as_flag(name) for name in _names(kind)]
+    for argument in arguments:  # tyro would take what follows an unknown flag for its value
+        flag = as_flag(argument.partition("=")[0].removeprefix("--"))
+        if argument.startswith("--") and flag.replace("--no-", "--") not in ("--", "--help", *known):
+            like = difflib.get_close_matches(flag, known, 1)
+            fail(prog, f"unrecognized {flag}{f'; did you mean {like[0]}?' if like else ''}", see)
+    paragraphs = [f"Example: {kind.example}", *(inspect.getdoc(kind) or "").split("\n\n")]  # type: ignore[attr-defined]
+    fill = textwrap.TextWrapper(shutil.get_terminal_size().columns, " ", " ").fill  # tyro keeps lines with an indent
+    about = "\n".join(map(fill, [*paragraphs, "--version prints GridSim's version."]))
     config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)
     given: dict[str, Any] = {} if default is None else {"default": default}
-    asked: type = kind
-    if groups := getattr(kind, "groups", None):  # tyro shows each field of this type as a group
-        # A new run's groups get no default: settings made before the flags are known would already fix the policy.
-        asked = dataclasses.make_dataclass(kind.__name__, groups.items())
-        if default is not None:
-            given = {"default": asked(*(select(part, default) for part in groups.values()))}
     printed = io.StringIO()
     # Unless it writes to a terminal, tyro draws no box and uses no colours: its error is parsed below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
     with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
-            found: Any = tyro.cli(
-                asked, prog=prog, description=_about(kind), args=arguments, config=config, registry=registry, **given
+            return tyro.cli(
+                kind, prog=prog, description=about, args=arguments, config=config, registry=registry, **given
             )
-            return kind(**{k: v for name in groups for k, v in vars(getattr(found, name)).items()}) if groups else found
         except BrokenPipeError:  # the reader has left, as in `--help | head`
             raise SystemExit(0) from None
         except SystemExit as stop:
             if not stop.code:
                 raise
     # tyro prints a title, what is wrong, and where to read more, separated by rules.
-    parts = re.split(r"-{9,}", printed.getvalue())
-    reason = " ".join(parts[1].split()) if len(parts) > 1 else "cannot read these flags"
-    for words, plain in PLAIN.items():
-        reason = re.sub(words, plain, reason)
-    fail(prog, reason, f"see {command_path(prog)} --help")
+    reason = re.split(r"-{9,}", printed.getvalue())[1]
+    fail(prog, " ".join(reason.split()).removeprefix("Error parsing "), see)
 
 
-def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
-    """Fail for an unknown flag, naming the most similar one, or what replaces a removed one."""
-    fields = dataclasses.fields(kind)
-    known = [as_flag(f.name) for f in fields if "Positional" not in str(f.type)]
-    for argument in arguments:
-        flag = as_flag(argument.partition("=")[0].removeprefix("--"))
-        if not argument.startswith("--") or {flag, flag.replace("--no-", "--")} & {"--", "--help", *known}:
-            continue
-        if instead := getattr(kind, "removed", {}).get(flag):
-            raise GridSimError(f"{flag} was removed: {instead}")
-        like = difflib.get_close_matches(flag, known, 1)
-        meant = f"; did you mean {like[0]}?" if like else ""
-        fail(prog, f"unrecognized {flag}{meant}", f"see {command_path(prog)} --help")
+def _names(kind: Any) -> Iterator[str]:
+    """Names of the fields of a command's flags, in groups or not."""
+    types = get_type_hints(kind)
+    for f in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(types[f.name]):
+            yield from _names(types[f.name])
+        else:
+            yield f.name
 
 
 def as_flag(name: str) -> str:
     """A field's name as a flag."""
     return f"--{name.replace('_', '-')}"
-
-
-def _about(kind: type) -> str:
-    """A command's description as --help shows it. tyro keeps lines that begin with a space."""
-    summary, *more = inspect.cleandoc(kind.__doc__ or "").split("\n\n")
-    paragraphs = [summary, f"Example: {kind.example}", *more, "--version prints GridSim's version."]  # type: ignore[attr-defined]
-    width = shutil.get_terminal_size().columns
-    return "\n".join(textwrap.fill(text, width, initial_indent=" ", subsequent_indent=" ") for text in paragraphs)
 
 
 def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
@@ -229,9 +201,8 @@ def warn_of_many_workers(prog: str, workers: int, address: str | None) -> None:
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
     """Run a command and exit with the code that `body` returns.
 
-    Errors for the user are shown in one line, followed by the hint for their type, if any; warnings in one line.
+    Errors for the user are shown in one line, followed by the hint for their type, if any.
     """
-    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
     for stream in (sys.stdout, sys.stderr):  # a path that the terminal's encoding lacks is no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="surrogateescape" if stream.encoding.lower() == "utf-8" else "backslashreplace")

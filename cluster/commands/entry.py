@@ -17,33 +17,12 @@ from pathlib import Path
 from cluster import stopping
 
 STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
-#: MLflow and PyTorch create a million objects that are never freed. With Python's default thresholds, garbage
-#: collection takes a sixth of their import time.
-GC_THRESHOLDS = (200_000, 20, 20)
-#: How a notebook or a user's own settings change what matplotlib draws, and whether it can be imported at all.
-PLOTTING = ("MPLBACKEND", "MATPLOTLIBRC")
-
-
-def settle_environment() -> None:
-    """Change the environment where libraries would fail with it; to be called before there are threads.
-
-    A process may have no HOME and a user id without a name (OpenShift, HTCondor, systemd). HOME is then a folder that
-    does not exist, as Debian's services have it, so that nothing is written there.
-    """
-    for name in PLOTTING:
-        os.environ.pop(name, None)
-    try:
-        Path.home()
-    except RuntimeError:
-        os.environ["HOME"] = "/nonexistent"
-    try:
-        getpass.getuser()
-    except (KeyError, OSError):
-        os.environ["USER"] = str(os.getuid())
 
 
 def _enter(module: str, name: str) -> None:
-    gc.set_threshold(*GC_THRESHOLDS)
+    # MLflow and PyTorch create a million objects that are never freed. With Python's default thresholds, garbage
+    # collection takes a sixth of their import time.
+    gc.set_threshold(200_000, 20, 20)
     if "--version" in sys.argv[1:]:
         from importlib.metadata import version  # which takes longer than all else until signals are handled
 
@@ -53,12 +32,18 @@ def _enter(module: str, name: str) -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # else the shell or nohup had it ignored
             # Until a command has something to save (`stopping.listen`).
             signal.signal(number, lambda *_: stopping.end_at_once())
-    settle_environment()
+    _settle_environment()
     prog = Path(sys.argv[0]).name
-    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"  # as `common.main`, also of imports
+    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
+    from gridsim.errors import GridSimError
+    from gridsim.packages import check_packages
+
     try:
-        _check_import(prog)
+        check_packages()
         getattr(import_module(f"cluster.commands.{module}"), name)()
+    except GridSimError as error:  # a user's file hides a package, or no folder can keep compiled kernels
+        print(f"{prog}: error: {error}", file=sys.stderr)
+        sys.exit(2)
     except SystemExit as ended:
         # Exit at once: the last garbage collection takes seconds with PyTorch, and threads may still be at work.
         with contextlib.suppress(OSError):
@@ -69,17 +54,23 @@ def _enter(module: str, name: str) -> None:
         os._exit(int(ended.code or 0))
 
 
-def _check_import(prog: str) -> None:
-    """Exit with one line if a user's file hides our packages, or no folder can keep compiled kernels."""
-    from gridsim.errors import GridSimError
-    from gridsim.packages import check_packages
+def _settle_environment() -> None:
+    """Change the environment where libraries would fail with it, before there are threads.
 
+    A notebook's or a user's settings of Matplotlib may keep it from being imported. A process may have no HOME and a
+    user id without a name (OpenShift, HTCondor, systemd): HOME is then a folder that does not exist, as Debian's
+    services have it, so that nothing is written there.
+    """
+    for name in ("MPLBACKEND", "MATPLOTLIBRC"):
+        os.environ.pop(name, None)
     try:
-        check_packages()
-        import gridsim.jit  # noqa: F401
-    except GridSimError as error:
-        print(f"{prog}: error: {error}", file=sys.stderr)
-        sys.exit(2)
+        Path.home()
+    except RuntimeError:
+        os.environ["HOME"] = "/nonexistent"
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):
+        os.environ["USER"] = str(os.getuid())
 
 
 evolve_main = partial(_enter, "cli", "evolve_main")

@@ -190,7 +190,7 @@ def read_finished(folder: Path, plan: Plan) -> list[Run]:
 def read_runs(folders: Iterable[Path]) -> list[Run]:
     """Finished runs from their folders, each once; a comparison's folder stands for its finished runs.
 
-    Raises: GridSimError.
+    Raises: GridSimError, also for the same run in two folders.
     """
     runs: list[Run] = []
     for folder in folders:
@@ -201,4 +201,8 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
         else:
             again = f"continue it with --resume {as_argument(folder)}"
             raise GridSimError(f"{folder}: none of its runs is finished; {again}")
-    return list({run.folder.resolve(): run for run in runs}.values())
+    once: dict[tuple[RunSettings, str], Run] = {}
+    for run in {run.folder.resolve(): run for run in runs}.values():
+        if (other := once.setdefault((run.settings, run.champion_sha256), run)) is not run:
+            raise GridSimError(f"{other.folder} and {run.folder} are the same run, made twice; leave one out")
+    return list(once.values())

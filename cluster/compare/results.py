@@ -75,7 +75,11 @@ def read_run(folder: Path) -> Run:
 def measured(run: Run) -> Run:
     """A run with its ERROR_FIGURES, nan if its champion never drives a metre forward. Raises GridSimError."""
     road, traffic = run.settings.scenario, run.settings.traffic
-    found = series(load_champion(run.folder / CHAMPION), road, HELD_OUT_EPISODES, HELD_OUT_SEED, traffic)
+    champion, again = load_champion(run.folder / CHAMPION), f"--resume {as_argument(run.folder)}"
+    if champion.sha256 != run.champion_sha256:
+        files = f"{CHAMPION} and {SUMMARY} do not belong together"
+        raise GridSimError(f"{run.folder}: {files}; delete {SUMMARY}, and make both again with {again}")
+    found = series(champion, road, HELD_OUT_EPISODES, HELD_OUT_SEED, traffic)
     figures = errors(found, VehicleConfig()) if found else {}
     missed = {name: figures.get(original, math.nan) for name, original in ERROR_FIGURES.items()}
     return dataclasses.replace(run, figures={**run.figures, **missed})

@@ -107,6 +107,8 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         spec = PolicySpec.parse(meta["policy"])
         if genome.dtype != np.float32 or genome.shape != (spec.size,):
             raise ValueError(f"its genome does not fit {spec}")
+        if not np.isfinite(genome).all():
+            raise ValueError("some of its genes are not numbers")
         config = SimConfig(
             VehicleConfig(**sim["vehicle"]),
             SensorConfig(**sim["sensors"]),

@@ -181,7 +181,8 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
 
 def is_finished(run: RunFolder) -> bool:
     """Whether nothing is left to do: learning has ended by these settings, and all files are there."""
-    return run.saved is not None and (run.path / SUMMARY).is_file() and run.settings.ended(run.saved[1])
+    there = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION))
+    return run.saved is not None and there and run.settings.ended(run.saved[1])
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

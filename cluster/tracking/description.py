@@ -49,8 +49,8 @@ def read_run(folder: Path) -> Content | None:
     except (OSError, LookupError, TypeError, ValueError) as error:  # edited by hand, or cut off
         if isinstance(error, GridSimError):
             raise
-        what = f"{path} is damaged ({type(error).__name__}: {error})"
-        raise TrackingError(f"{what}; delete it, and make it again with --resume {shlex.quote(str(folder))}") from error
+        what = f"{path} is damaged ({type(error).__name__}: {error}); delete it and {folder / 'summary.json'}"
+        raise TrackingError(f"{what}, and make them again with --resume {shlex.quote(str(folder))}") from error
     if not rows:
         return None
     return Content(

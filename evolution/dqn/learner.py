@@ -28,6 +28,7 @@ from torch.optim.adam import adam
 from evolution.dqn.replay import Batch, Replay
 from evolution.networks.export import layers_of
 from evolution.networks.policy import KERNEL_1, KERNEL_2, STRIDE_1, STRIDE_2, CnnSpec, PolicySpec, squash
+from gridsim.errors import GridSimError
 from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS
 
@@ -81,12 +82,12 @@ def finite(numbers: T, update: int) -> T:
 def device_of(name: str) -> torch.device:
     """The device `auto`, `cpu` or `cuda`; `auto` is cuda where there is one.
 
-    Raises: ValueError for a missing device.
+    Raises: GridSimError for a missing device.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     if not torch.cuda.is_available():
-        raise ValueError(f"PyTorch finds no device {name!r} here; use --device cpu")
+        raise GridSimError(f"PyTorch finds no device {name!r} here; use --device cpu")
     return torch.device("cuda", 0)
 
 
@@ -165,7 +166,7 @@ def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
 class DqnLearner:
     """A Q network in training; `seed` is that of its initial weights and its samples.
 
-    Raises: ValueError for a missing device (`device_of`).
+    Raises: GridSimError for a missing device (`device_of`).
     """
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):

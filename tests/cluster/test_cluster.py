@@ -110,12 +110,12 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
         assert all(isinstance(value, str) for value in group["rayStartParams"].values())
         if group is workers:
             assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
-            assert group["replicas"] * int(container["resources"]["limits"]["cpu"]) == parsed.workers
+            assert group["replicas"] * int(container["resources"]["limits"]["cpu"]) == parsed.work.workers
             probed = container["readinessProbe"]["tcpSocket"]["port"]
             assert probed == int(group["rayStartParams"]["node-manager-port"])
     (mount,) = container["volumeMounts"]  # of the head, which came last
-    assert parsed.output == mount["mountPath"]
-    assert parsed.tracking_uri.startswith(f"sqlite:///{mount['mountPath']}/")
+    assert parsed.work.output == mount["mountPath"]
+    assert parsed.work.tracking_uri.startswith(f"sqlite:///{mount['mountPath']}/")
     claim = pod["volumes"][0]["persistentVolumeClaim"]["claimName"]
     assert claim == documents["PersistentVolumeClaim"]["metadata"]["name"]
 

@@ -10,7 +10,7 @@ import pytest
 from finished_runs import make_run
 
 from cluster.commands.cli import DqnFlags, EvolveFlags
-from cluster.commands.common import parse, select
+from cluster.commands.common import parse
 from cluster.compare.plan import UNLIMITED, Plan, limits, read_plan, read_runs, write_plan
 from cluster.compare.processes import flags_of
 from cluster.compare.results import LEARNERS
@@ -108,8 +108,8 @@ def test_the_flags_of_a_run_give_its_settings():
         for run in plan.planned(Path("runs/c")):
             kind: Any = EvolveFlags if run.settings.command == "gridsim-evolve" else DqnFlags
             flags = parse(kind, run.settings.command, flags_of(run, wall_time=9.5))
-            assert select(type(run.settings), flags) == run.settings
-            assert (flags.output, flags.name, flags.wall_time) == ("runs/c", run.name, 9.5)
+            assert flags.learning == run.settings
+            assert (flags.work.output, flags.run.name, flags.run.wall_time) == ("runs/c", run.name, 9.5)
 
 
 def test_edited_comparison_is_refused(tmp_path):

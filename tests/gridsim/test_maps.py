@@ -14,7 +14,7 @@ from commands import finish
 from pictures import PPM, H, W, crashes, distance, picture, read, save, strip, write_yaml
 from PIL import Image
 
-from cluster.commands.cli import EvolveFlags, _prepare
+from cluster.commands.cli import _prepare
 from cluster.settings import EvolveSettings
 from cluster.store.champion import Champion, evaluate
 from cluster.store.folder import RunError, new_run, open_run, read_config
@@ -260,7 +260,9 @@ def test_environments_and_champions_drive_on_it(track):
 
 
 def test_traffic_that_a_map_cannot_have_changes_nothing(track, capsys):
-    asked, plain = (_prepare(EvolveFlags, ["--scenario", track.name, "--traffic", n])[1].settings for n in ("3", "0"))
+    asked, plain = (
+        _prepare("gridsim-evolve", ["--scenario", track.name, "--traffic", n])[1].settings for n in ("3", "0")
+    )
     assert asked == plain
     assert capsys.readouterr().err == f"gridsim-evolve: {track.name} has no lanes for traffic; running without\n"
 
