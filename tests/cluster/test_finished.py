@@ -1,11 +1,13 @@
 """Finished runs: what is read and measured once, what is damaged, what is refused."""
 
+import dataclasses
 import json
 
 import pytest
 from finished_runs import HELD_OUT, make_run
 
 import gridsim
+from cluster.compare.plan import read_runs
 from cluster.compare.results import ERROR_FIGURES, measured, read_run
 from gridsim.errors import GridSimError
 
@@ -35,8 +37,6 @@ def test_runs_are_compared_from_python(tmp_path):
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
         ("summary.json", {"car_steps": 10**400}, "damaged"),
         ("summary.json", {"held_out": {}}, "make it again with --resume"),
-        ("champion.npz", None, "no such file"),
-        ("champion.npz", "PK", "truncated|not a GridSim file"),
     ],
 )
 def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
@@ -49,8 +49,19 @@ def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
         read_run(tmp_path / "a")
 
 
-def test_a_champion_that_is_damaged_is_told_as_its_errors_are_measured(tmp_path):
+def test_a_champion_that_is_damaged_or_another_runs_is_told_as_its_errors_are_measured(tmp_path):
     make_run(tmp_path / "a")
-    (tmp_path / "a/champion.npz").write_text("PK")
+    run, champion = read_run(tmp_path / "a"), tmp_path / "a/champion.npz"
+    with pytest.raises(GridSimError, match="champion.npz and summary.json do not belong together"):
+        measured(dataclasses.replace(run, champion_sha256="another"))
+    champion.write_text("PK")
     with pytest.raises(GridSimError, match=r"^[^\n]*not a GridSim file[^\n]*$"):
-        measured(read_run(tmp_path / "a"))
+        measured(run)
+
+
+def test_the_same_run_in_two_folders_is_refused(tmp_path):
+    folders = [tmp_path / "a/run", tmp_path / "b/run"]
+    for folder in folders:
+        make_run(folder)
+    with pytest.raises(GridSimError, match="are the same run, made twice; leave one out"):
+        read_runs(folders)

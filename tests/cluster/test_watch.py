@@ -147,10 +147,12 @@ def test_what_cannot_be_written_is_told_in_one_line(name, tmp_path, monkeypatch,
         raise OSError(errno.EROFS, "Read-only file system", str(path))
 
     monkeypatch.chdir(tmp_path)
+    drive = CHAMPION, "--seconds", 1, "--size", "64x64", "--output"
+    assert call(watch_main, monkeypatch, capsys, *drive, f"first-{name}")[0] == 0  # its kernels are compiled
     monkeypatch.setattr("builtins.open", lambda path, *_, **__: refuse(path))
     for method in ("touch", "unlink"):  # a read-only file system refuses to unlink even what is not there
         monkeypatch.setattr(Path, method, refuse)
-    code, _, err = call(watch_main, monkeypatch, capsys, CHAMPION, "--seconds", 1, "--size", "64x64", "--output", name)
+    code, _, err = call(watch_main, monkeypatch, capsys, *drive, name)
     assert (code, err) == (1, f"gridsim-watch: error: {name}: cannot be written: Read-only file system\n")
 
 
