@@ -52,7 +52,7 @@ def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
 def test_a_champion_that_is_damaged_or_another_runs_is_told_as_its_errors_are_measured(tmp_path):
     make_run(tmp_path / "a")
     run, champion = read_run(tmp_path / "a"), tmp_path / "a/champion.npz"
-    with pytest.raises(GridSimError, match="champion.npz and summary.json do not belong together"):
+    with pytest.raises(GridSimError, match=r"champion\.npz and summary\.json do not belong together"):
         measured(dataclasses.replace(run, champion_sha256="another"))
     champion.write_text("PK")
     with pytest.raises(GridSimError, match=r"^[^\n]*not a GridSim file[^\n]*$"):
