@@ -111,11 +111,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             ("observation", observation, ("rays", "grid", "image")),
             ("actions", actions, ("discrete", "continuous")),
             ("render_mode", render_mode, (None, "rgb_array", "human")),
-            (
-                "autoreset_mode",
-                getattr(autoreset_mode, "value", autoreset_mode),
-                [mode.value for mode in AutoresetMode],
-            ),
         ):
             if value not in known:
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
@@ -125,8 +120,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"motion and steering are only for rays; leave them out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
-        if map_seed < 0:
-            raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
         self.num_envs, self.config = num_envs, config or SimConfig()
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {

@@ -127,7 +127,7 @@ def test_a_name_that_the_terminal_cannot_show_is_no_error(encoding, tmp_path):
 def test_names_of_any_bytes_are_drawn_and_compared(tmp_path, monkeypatch, capsys):
     name = os.fsdecode(b"M\xfcller $5 $x^ <b>")
     states = np.zeros((20, FIELDS), dtype=np.float32)
-    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]])[0], states, tmp_path / "drive.png", f"{name} 漢")
+    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]]), states, tmp_path / "drive.png", f"{name} 漢")
     make_run(tmp_path / "run")
     (tmp_path / "run").rename(tmp_path / name)
     (tmp_path / name / "drive.html").touch()

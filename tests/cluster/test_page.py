@@ -78,7 +78,7 @@ def shown_drives():
 
 
 def test_a_map_file_is_shown_from_side_to_side_of_its_road():
-    road_map, _ = small_map([[20.0, 40.0, 44.0, 40.0, 4.0]])  # its ends are round
+    road_map = small_map([[20.0, 40.0, 44.0, 40.0, 4.0]])  # its ends are round
     assert pictures.bounds(road_map) == pytest.approx([16.0 - 5, 48.0 + 5, 36.0 - 5, 44.0 + 5], abs=0.6)
 
 
@@ -122,6 +122,6 @@ def test_the_picture_of_a_drive_over_the_edge_has_no_line_across(tmp_path, monke
     monkeypatch.setattr(pictures, "figure_of", lambda *size: figure)
     states = np.zeros((20, FIELDS), dtype=np.float32)
     states[:, X], states[:, Y] = np.arange(50, 90, 2) % 64, 32.0
-    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]])[0], states, tmp_path / "drive.png", "a drive")
+    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]]), states, tmp_path / "drive.png", "a drive")
     (lines,) = (each for each in figure[1][0].collections if isinstance(each, LineCollection))
     assert [np.ptp(line, axis=0).tolist() for line in lines.get_segments()] == [[2.0, 0.0]] * 18

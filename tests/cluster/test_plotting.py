@@ -28,7 +28,7 @@ def test_a_run_ends_well_whatever_the_plotting_variables_of_a_notebook_say(tmp_p
 
 
 def test_pictures_do_not_depend_on_settings_of_matplotlib(tmp_path):
-    road_map = small_map([[0, 32, 64, 32, 4.0]])[0]
+    road_map = small_map([[0, 32, 64, 32, 4.0]])
     states = np.zeros((20, FIELDS), dtype=np.float32)
     names = ("q/mean", "loss", "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean")
     history = [dict.fromkeys((*names, "validation/success_rate", "network/success_rate"), 0.5)] * 3

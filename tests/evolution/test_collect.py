@@ -113,15 +113,6 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask):
     assert set(results["end"]) == {End.COLLISION, End.IDLE, End.SUCCESS, End.TIME}
 
 
-@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_a_network_without_numbers_leaves_whole_rows(ask, policy):
-    of = ask(policy, 6, 0.5, 0)
-    experience, results = collect(*of._replace(weights=np.full_like(of.weights, math.nan)))
-    assert experience.actions.tolist() == [NO_ACTION] * 6
-    assert not np.any([experience.ends, experience.rewards, results["distance"]])
-    assert (results["end"] == End.IDLE).all()
-
-
 def test_random_actions_are_uniform_and_as_many_as_asked_for(ask):
     of = ask("mlp:6,7", 600, 1.0, 0)
     counts = np.bincount(collect(*of)[0].actions, minlength=256)[:8]

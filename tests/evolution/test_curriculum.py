@@ -26,17 +26,6 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
     return episodes, rewound
 
 
-def test_a_leader_s_episodes_are_longer_and_rewound(curriculum):
-    episodes = curriculum.leader_episodes(0)
-    assert len(episodes.rows) == 8
-    assert (episodes.rows["rewind"] == CONFIG.rewind).all()
-    assert (episodes.rows["target"] == 2.5 * 150.0).all()
-    of_members = curriculum.episodes(0).rows
-    assert (of_members["rewind"] == 0).all()
-    assert (episodes.rows["steps"] == episodes.rows["steps"][0]).all()
-    assert episodes.rows["steps"][0] > of_members["steps"].max()
-
-
 @pytest.mark.parametrize(("pace", "share"), [(0.5, 0.5), (1.0, 1.0), (2.0, 1.0)])
 def test_a_validation_score_is_the_success_rate_and_less_for_slow_drivers_only(curriculum, pace, share):
     results = np.zeros((2, 4), dtype=RESULT)
@@ -116,9 +105,3 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again(curriculum):
     led(curriculum, 1, End.COLLISION)
     assert len(curriculum.failures) == len(curriculum.crashes) == CONFIG.crash_memory
     assert curriculum.failures[-8:] == pytest.approx(0.5)
-
-
-def test_maps_come_in_one_by_one(curriculum):
-    assert [curriculum.maps_in_use(generation) for generation in (0, 1, 2, 8)] == [2, 3, 3, 3]
-    assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
-    assert len(set(curriculum.map_seeds)) == 3

@@ -10,10 +10,10 @@ import onnxruntime
 import pytest
 
 from evolution.networks import convnet
-from evolution.networks.export import example, to_onnx
+from evolution.networks.export import to_onnx
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on, outputs_of
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
-from gridsim.sensing.grid import CELLS, FREE
+from gridsim.sensing.grid import CELLS
 
 F = np.float32
 OTHER = SimConfig(VehicleConfig(speed_limit=20.0, steering_limit=20.0), SensorConfig(range=30.0))
@@ -89,22 +89,3 @@ def test_the_same_genome_gives_the_same_file_in_any_process_without_torch(text, 
         subprocess.run([sys.executable, "-c", script, text, str(file)], check=True)
     assert files[0].read_bytes() == files[1].read_bytes()
     onnx.checker.check_model(onnx.load(files[0]), full_check=True)
-    spec = PolicySpec.parse(text)
-    other = to_onnx(spec, np.linspace(-1, 2, spec.size, dtype=F), SimConfig())
-    assert len(other) == len(files[0].read_bytes())
-    assert other != files[0].read_bytes()
-
-
-@pytest.mark.parametrize("genome", [np.zeros(312, dtype=F), np.zeros(311), np.zeros((1, 311), dtype=F)])
-def test_another_genome_is_refused(genome):
-    with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
-        to_onnx(PolicySpec.parse("mlp:6,7"), genome, SimConfig())
-
-
-def test_the_example_sees_nothing_at_standstill_and_at_10_mps():
-    shown = example(PolicySpec.parse("mlp:3+motion+steering"), OTHER)
-    assert shown == pytest.approx(np.array([[1.0] * 31 + [0.0] * 31 + [share, 0.0] for share in (0.0, 10.0 / 20.0)]))
-    shown = example(PolicySpec.parse("cnn:8,8,8@2"), OTHER)
-    assert (shown[:, :-1] == FREE).all()
-    assert shown[:, -1].tolist() == [0.0, 10.0]
-    assert shown.dtype == F

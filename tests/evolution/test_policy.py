@@ -61,14 +61,6 @@ def test_a_gene_that_is_not_a_number_is_no_action():
         assert kernel_outputs(spec, spoilt, inputs)[1] == -1, gene
 
 
-def test_the_first_of_equal_outputs_acts():
-    spec = PolicySpec.parse("mlp:3")
-    for action in range(8):
-        genome = np.zeros(spec.size, dtype=F)
-        genome[-8 + action :] = 1.0
-        assert kernel_outputs(spec, genome, np.zeros(32, dtype=F))[1] == action
-
-
 def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
     x = np.arange(-6.0, 6.0, 1 / 256).astype(F)
     y = np.array([squash(each) for each in x], dtype=float)

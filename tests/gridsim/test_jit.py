@@ -176,12 +176,6 @@ def test_what_another_user_has_put_into_the_temporary_folder_is_never_run(small,
     assert not marker.exists()
     assert Path(ours["folder"]).is_relative_to(temporary)
     assert [path.name for path in temporary.iterdir()] == [planted.name], "ours is removed in the end"
-    environment = {"GRIDSIM_CACHE_DIR": str(tmp_path / "file"), "TMPDIR": str(temporary)}
-    done = finish("gridsim-evaluate", "nothing.npz", cwd=tmp_path, code=2, **environment)
-    warning, error, *_ = done.stderr.splitlines()
-    assert warning.startswith("gridsim-evaluate: warning: kernels are compiled anew each time")
-    assert error.startswith("gridsim-evaluate: error: ")
-    assert [path.name for path in temporary.iterdir()] == [planted.name]
 
 
 class _Touch:
@@ -227,25 +221,7 @@ def test_on_a_full_disk_kernels_are_compiled_and_not_kept(small, tmp_path):
     assert [small(cache)["from_cache"] for _ in range(2)] == [0, 1]
 
 
-# --- whose sources
-
-
-DIGEST = "import gridsim, json; from gridsim import jit; print(json.dumps(jit.kernel_digest()))"
-
-
-@pytest.mark.e2e
-@pytest.mark.parametrize("name", ["evolution.py", "evolution/x.py", "gridsim/x.py"])
-def test_what_else_has_our_packages_names_is_no_source_of_kernels(tmp_path, name):
-    (tmp_path / "work" / name).parent.mkdir(parents=True)
-    (tmp_path / "work" / name).write_text("raise SystemExit('imported')")
-    assert python(DIGEST, tmp_path / "work", tmp_path / "cache") == jit.kernel_digest()
-
-
-@pytest.mark.e2e
-def test_a_folder_with_a_packages_name_hides_nothing(tmp_path):
-    for name in ("gridsim", "evolution", "cluster"):
-        (tmp_path / name).mkdir()
-    finish("python", "-c", "import gridsim; gridsim.evolve", cwd=tmp_path)
+# --- what hides our packages
 
 
 @pytest.mark.e2e

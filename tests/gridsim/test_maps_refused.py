@@ -28,19 +28,14 @@ def refused(name):
     return str(caught.value)
 
 
-def bomb(path, width, height):
+def test_a_bomb_is_not_decoded(tmp_path):
     """A PNG of a few bytes that would be very large: its header, of the bytes 12 to 33, says so."""
+    path = tmp_path / "bomb.png"
     png = bytearray(Path(save(path, np.zeros((9, 9), np.uint8))).read_bytes())
-    png[16:24] = struct.pack(">II", width, height)
+    png[16:24] = struct.pack(">II", 10_000, 7_000)
     png[29:33] = struct.pack(">I", zlib.crc32(png[12:29]))
     path.write_bytes(png)
-    return path
-
-
-@pytest.mark.parametrize(("width", "height"), [(10_000, 7_000), (20_000, 20_000), (2**31 - 1, 2**31 - 1), (0, 5)])
-def test_bombs_are_not_decoded(tmp_path, width, height):
-    message = refused(bomb(tmp_path / "bomb.png", width, height))
-    assert f"{MAX_PIXELS:,}" in message or not width or width > 1 << 30
+    assert f"{MAX_PIXELS:,}" in refused(path)
 
 
 def test_pictures_that_are_no_maps(tmp_path):
@@ -72,24 +67,19 @@ WRONG = {
     "image: map.png": "resolution",
     "{image: map.png, resolution: .nan}": "not nan",
     "{image: map.png, resolution: 1e9}": "from 0.01 to 1",
-    "{image: map.png, resolution: true}": "not True",
-    "{image: map.png, resolution: 0x" + "f" * 9000 + "}": "resolution",
     "{image: map.png, resolution: 1}": "is too large",
     "{resolution: 0.1, image: [map.png]}": "image must name",
     "{resolution: 0.1, image: /map.png}": "own folder",
     "{resolution: 0.1, image: link.png}": "own folder",
     "{resolution: 0.1, image: loop.png}": "loop.png",
-    '{resolution: 0.1, image: "a\\0.png"}': "not a valid path",
     "{resolution: 0.1, image: none.png}": "No such file",
     "{image: map.png, resolution: 0.1, start: []}": "unknown key 'start'",
     "{image: map.png, resolution: 0.1, free_thresh: 0.7}": "not above occupied_thresh",
     "{image: map.png, resolution: 0.1, negate: 2}": "negate",
-    "{image: map.png, resolution: 0.1, mode: {}}": "mode",
     "{image: map.png, resolution: 0.1, origin: [0, 0, 0.5]}": "yaw",
     "{image: map.png, resolution: 0.1, speed: [9, 3]}": "speed",
     "{image: map.png, resolution: 0.1, starts: {x: 1}}": "starts",
     "{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}": "heading",
-    "{image: map.png, resolution: 0.1, starts: &a [*a, *a]}": "start",
 }
 
 
@@ -128,9 +118,6 @@ def loads_or_is_refused(path):
         assert not crashes(scenario.road, scenario.starts).any()
 
 
-FUZZ = settings(max_examples=40)
-
-
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.dates() | st.binary()
 values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
 GOOD = {
@@ -139,7 +126,7 @@ GOOD = {
 }  # fmt: skip
 
 
-@FUZZ
+@settings(max_examples=40)
 @given(changes=st.dictionaries(st.sampled_from([*GOOD, "other"]), values, max_size=3), drop=st.booleans())
 def test_any_values(small, changes, drop):
     path = small[0] / "values.yaml"

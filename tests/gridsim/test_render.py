@@ -9,9 +9,9 @@ from pictures import read
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
-from gridsim.state import CAR_FIELDS, COS, SIN, SPEED, STEERING, X, Y
+from gridsim.state import CAR_FIELDS, COS, SIN, X, Y
 from gridsim.view import paint, render
-from gridsim.view.render import Renderer, interpolate
+from gridsim.view.render import Renderer
 
 
 @pytest.fixture(scope="module")
@@ -125,15 +125,3 @@ def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     ahead = image[: int(240 * render.CAR_AT) - 25]
     ground = np.minimum(distance(ahead, paint.GROUND), distance(ahead, paint.GROUND_OTHER))
     assert ground.max() <= 1
-
-
-def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):
-    width = float(scenario.road.width)
-    a, b = car_at(width - 1.0, 5.0, 0.0), car_at(1.0, 5.0, 1.0)
-    b[SPEED], b[STEERING] = 4.0, 0.2
-    half = interpolate(a, b, 0.5, scenario)
-    assert half[X] % width == pytest.approx(0.0, abs=1e-3)
-    assert np.arctan2(half[SIN], half[COS]) == pytest.approx(0.5, abs=1e-3)
-    assert np.hypot(half[SIN], half[COS]) == pytest.approx(1.0, abs=1e-6)
-    assert half[SPEED] == pytest.approx(2.0)
-    assert interpolate(a, b, 0.0, scenario) == pytest.approx(a)

@@ -8,17 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pictures import crashes
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from gridsim.car.vehicle import Action
 from gridsim.config import CROSSING_GAP
-from gridsim.errors import GridSimError
 from gridsim.jit import freeze
 from gridsim.maps.generators import curved, highway, roundabout
 from gridsim.maps.map import sample_starts
-from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, Strips, clearance_nodes, clearances
 from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.simulator import Simulator
 from gridsim.state import SPEED, End
@@ -164,6 +165,23 @@ def test_a_car_on_rails_touches_nothing(laid):
         assert exact.outline_on_road(np.concatenate(poses), 2.0, 1.0).all()
 
 
+SIDE = 64.0  # m, of the maps of any strips and blocks
+inside, half_width = st.floats(0, SIDE), st.floats(0.5, 6.0)
+lines = st.tuples(inside, inside, inside, inside, half_width)
+arcs = st.tuples(inside, inside, st.floats(1.0, 25.0), st.floats(-7, 7), st.floats(-6.2, 6.2), half_width)
+blocks = st.tuples(inside, inside, st.floats(-7, 7), st.floats(0.5, 3.0), st.floats(0.5, 3.0))
+
+
+@settings(max_examples=100, derandomize=True)
+@given(st.lists(lines, max_size=3), st.lists(arcs, min_size=1, max_size=3), st.lists(blocks, max_size=2))
+def test_nodes_are_exact_for_any_strips_and_blocks(lines, arcs, blocks):
+    strips = Strips.of(lines, arcs, blocks)
+    nodes = clearance_nodes(strips, SIDE, SIDE)
+    j, i = np.meshgrid(*[np.arange(0, round(SIDE * CELLS_PER_M), 3)] * 2, indexing="ij")
+    expected = oracle.ExactRoad(strips, SIDE, SIDE).clearance(np.column_stack([i.ravel(), j.ravel()]) / CELLS_PER_M)
+    assert nodes[j, i].ravel() == pytest.approx(np.maximum(expected, FIELD_FLOOR), abs=1e-4)
+
+
 def test_the_field_is_the_exact_road(built):
     for scenario in built:
         exact = oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
@@ -217,12 +235,6 @@ def test_no_road_can_be_driven_without_steering(name):
         while (simulator.ends == End.RUNNING).any():
             simulator.step(np.where(simulator.cars[:, SPEED] < pace, Action.ACCELERATE, Action.NONE))
         assert (simulator.ends == End.SUCCESS).mean() <= 0.02
-
-
-@pytest.mark.parametrize(("wrong", "seed"), [("seemless", 0), ("", 0), ("seamless", -1)])
-def test_what_is_not_there_is_refused_in_one_line(wrong, seed):
-    with pytest.raises(GridSimError, match=r"^[^\n]+$"):
-        build(wrong, seed)
 
 
 # --- Each of them ----------------------------------------------------------------------------------------------------

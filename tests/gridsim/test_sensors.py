@@ -82,7 +82,7 @@ def test_rays_are_those_of_the_exact_geometry(places):
 def test_no_ray_passes_a_wall(half, wall, thinnest):
     """Two roads side by side, a wall between them: rays from one never reach the other, from wherever they start."""
     strips = [[0, 20.2, 64, 20.2, half], [0, 20.2 + 2 * half + wall, 64, 20.2 + 2 * half + wall, half]]
-    road = small_map(strips)[0].road._replace(thinnest=F(thinnest))
+    road = small_map(strips).road._replace(thinnest=F(thinnest))
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(0, 64, 1000), 20.2 + (half - 0.5) * rng.uniform(-1, 1, 1000)], axis=1).astype(F)
     headings = rng.uniform(0.1, math.pi - 0.1, 1000)

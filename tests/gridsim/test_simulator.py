@@ -157,13 +157,13 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
 @pytest.fixture(scope="module")
 def plain():
     """Road everywhere: a torus of 128 m without an edge."""
-    return small_map([[0, y, 128, y, 40.0] for y in (0, 40, 80)], width=128.0, height=128.0)[0]
+    return small_map([[0, y, 128, y, 40.0] for y in (0, 40, 80)], width=128.0, height=128.0)
 
 
 @pytest.fixture(scope="module")
 def straight():
     """A road of 8 m round a torus of 1,024 m, along x."""
-    return small_map([[0, 32.0, 1024, 32.0, 4.0]], width=1024.0)[0]
+    return small_map([[0, 32.0, 1024, 32.0, 4.0]], width=1024.0)
 
 
 @pytest.mark.parametrize(("speed", "radius"), [(4.0, 5.06), (7.0, 49 / 4.9), (11.5, 11.5**2 / 4.9)])
@@ -208,7 +208,7 @@ def test_back_and_forth_earns_the_furthest_point(straight):
 def test_nothing_tunnels_through_a_thin_wall(wall, heading):
     """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
     lines = [[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]]
-    road_map, _ = small_map(lines, width=128.0, height=128.0)
+    road_map = small_map(lines, width=128.0, height=128.0)
     first, edge, way = (40.0, 80.0, 1) if heading < 1.0 else (120.0, 80.0 + wall, -1)
     for k in range(32):
         r = run(road_map, [first + 0.1 * k * way, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
@@ -229,20 +229,14 @@ def test_a_start_is_taken_onto_the_torus(straight):
     assert not car[[DISTANCE, PACED, ODOMETER, IDLE, STEPS]].any()
 
 
-def test_arrays_of_other_shapes_are_refused_and_cars_that_begin_without_traffic_have_none():
+def test_cars_that_begin_without_traffic_have_none():
     scenario = build("curved", 0)
     starts = sample_starts(scenario, 4, np.random.default_rng(0))
     worlds = spawn(scenario.network, starts, 3, np.arange(4, dtype=np.uint64), CONFIG)
     simulator = Simulator(4, traffic=3)
-    with pytest.raises(RuntimeError, match="before every car was reset"):
-        simulator.step(np.zeros(4, dtype=int))
-    with pytest.raises(ValueError, match="traffic must be 4 worlds of 3 cars, not"):
-        simulator.reset(scenario, starts, worlds=worlds[:1])
     with pytest.raises(ValueError, match="there are 4 cars, not"):
         simulator.reset(scenario, starts[:3])
     simulator.reset(scenario, starts, worlds=worlds)
-    with pytest.raises(ValueError, match="there are 4 cars, not actions of shape"):
-        simulator.step(np.zeros(1, dtype=int))
     assert (simulator.worlds[:, :, LANE] >= 0).any()
     simulator.reset(scenario, starts[:2], cars=np.array([0, 1]))
     assert (simulator.worlds[:2, :, LANE] < 0).all()

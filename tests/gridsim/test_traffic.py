@@ -14,16 +14,14 @@ from scipy import stats
 from gridsim.car.collision import boxes_touch, hits_box
 from gridsim.car.vehicle import path_curvature
 from gridsim.config import SimConfig, VehicleConfig, constants
-from gridsim.jit import freeze, njit
+from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
-from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.state import (
     ALONG,
     COS,
-    DRAWS,
     LANE,
     LANE_TIMER,
     NEXT,
@@ -33,7 +31,6 @@ from gridsim.state import (
     SPEED,
     SPEED_FACTOR,
     STEERING,
-    TRAFFIC_FIELDS,
     X,
     Y,
 )
@@ -144,26 +141,6 @@ def test_spawned_cars_keep_their_distance(scenario):
         assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
         for k in range(1, len(here)):
             assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
-
-
-def test_no_car_keeps_further_right_than_there_is_room():
-    for name in REGISTRY:
-        scenario = build(name, 3)
-        network, traffic, room = scenario.network, CONFIG.traffic, scenario.network.room
-        first = np.setdiff1d(np.arange(len(room)), network.offsets[1:] - 1)
-        along = network.points[first + 1] - network.points[first]
-        along /= np.hypot(*along.T)[:, None]
-        right = network.points[first] + room[first, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
-        kerb = clearances(scenario.road, freeze(right.astype(F)))
-        assert (room >= 0.0).all()
-        assert (kerb[room[first] > 0] >= CONFIG.vehicle.width / 2 + traffic.verge - 0.02).all()
-        assert room.max() == (0.0 if name == "highway" else pytest.approx(traffic.give_way))
-        # Gently, from lane to lane as well.
-        steps = np.repeat(network.steps, np.diff(network.offsets))
-        assert (np.abs(np.diff(room))[first] <= traffic.taper * steps[first] + 1e-4).all()
-        lane, k = np.nonzero(network.successors >= 0)
-        gaps = room[network.offsets[lane + 1] - 1] - room[network.offsets[network.successors[lane, k]]]
-        assert (np.abs(gaps) <= traffic.taper * network.steps[lane] + 1e-4).all()
 
 
 # --- How they drive --------------------------------------------------------------------------------------------------
@@ -386,15 +363,6 @@ def test_a_car_changes_lanes_for_a_faster_one_behind(abreast, behind, gives_way)
     assert (world[0, LANE] == 0) == gives_way
 
 
-def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
-    """Its loss is against its present acceleration, behind a car of its own, and not against a free road."""
-    ahead, follower = (1, 214.8, 8.0, 0.4), (0, 186.0, 8.0, 2.0)
-    world = cars_on(abreast, ahead, (1, 200.0, 8.0, 0.8), follower, (0, 222.0, 8.0, 0.4))
-    world[[0, 2, 3], LANE_TIMER] = 9.0
-    step_traffic(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
-    assert world[1, LANE] == 0
-
-
 @pytest.mark.parametrize(("behind", "changes"), [(36.0, False), (44.0, True)])
 def test_no_car_cuts_in_where_its_new_follower_would_have_to_brake_hard(abreast, behind, changes):
     """MOBIL's safety criterion, for a car that is held up and does not care what others lose."""
@@ -404,19 +372,6 @@ def test_no_car_cuts_in_where_its_new_follower_would_have_to_brake_hard(abreast,
     assert (brakes <= CONFIG.traffic.safe_braking) == changes
     step_traffic(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
     assert (world[1, LANE] == 0) == changes
-
-
-def test_a_change_that_is_refused_leaves_no_trace(abreast):
-    """Moving over, it would touch the car ahead: it is as if its turn to decide had not come."""
-    world = cars_on(abreast, (1, 212.0, 0.0, 0.4), (1, 200.0, 15.0, 1.0))
-    world[:, LANE_TIMER] = 9.0
-    asked = world.copy()
-    asked[1, LANE_TIMER] = 0.0
-    step_traffic(abreast, D, world, NOBODY)
-    step_traffic(abreast, D, asked, NOBODY)
-    assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
-    same = np.setdiff1d(np.arange(TRAFFIC_FIELDS), [DRAWS, LANE_TIMER])
-    np.testing.assert_array_equal(asked[:, same], world[:, same])
 
 
 @pytest.mark.parametrize(
@@ -462,9 +417,3 @@ def test_traffic_alone_neither_crashes_nor_stops(scenario, seed, cars):
     # Each car is always on its lane.
     for lane, along in zip(history[::50, there, LANE].ravel(), history[::50, there, ALONG].ravel(), strict=True):
         assert 0.0 <= along < lane_length(network, int(lane))
-
-
-def test_the_ego_car_beside_the_lane_is_passed(ring):
-    history = watch(ring, cars_on(ring, (0, 400.0, 12.0, 1.0)), 20, ego(500.0, 32.0 + 2.6))
-    assert history[-1, 0, ALONG] == pytest.approx(640.0, abs=1.0)
-    assert history[:, 0, SPEED].min() > 11.9

@@ -108,13 +108,6 @@ def test_a_period_is_the_oracles(speed, steering, heading, action):
     assert abs(math.remainder(math.atan2(sine, cosine) - looks[-1, 2], 2 * math.pi)) < tolerance
 
 
-def test_the_heading_stays_a_unit_vector():
-    car = Driver(speed=5.0, steering=math.radians(20.0))
-    for _ in range(4000):
-        car.step(0.0)
-    assert math.hypot(car.state[2], car.state[3]) == pytest.approx(1.0, abs=1e-6)
-
-
 # --- The configuration -----------------------------------------------------------------------------------------------
 
 

@@ -13,12 +13,6 @@ def told(search, score):
     return genomes
 
 
-def leader(search):
-    found = search.leader()
-    assert found is not None
-    return found
-
-
 def state_of(search):
     return {name: array.tobytes() for name, array in search.state().items()}
 
