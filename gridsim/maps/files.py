@@ -36,6 +36,7 @@ PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp
 YAMLS = (".yaml", ".yml")
 KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed"]
 
+MAX_BYTES = 1 << 27
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
 # Limits, from and to.
@@ -106,8 +107,12 @@ def _shown(value: object) -> str:
 
 
 def _bytes(path: Path) -> bytes:
-    """A file's bytes. Raises: GridSimError."""
+    """A file's bytes; not those of a pipe or device, which may have no end, or of a file that is no map by its size."""
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise GridSimError(f"{path} is not a regular file")
+        if path.is_file() and path.stat().st_size > MAX_BYTES:
+            raise GridSimError(f"{path}: more than {MAX_BYTES >> 20} MiB; make it smaller")
         return path.read_bytes()
     except OSError as error:
         raise GridSimError(f"{path}: {error.strerror or error}") from None
