@@ -57,10 +57,11 @@ def test_a_database_of_another_mlflow_is_refused_before_it_is_migrated(tmp_path,
 
 
 def test_hosted_stores_and_those_of_plug_ins_are_left_to_mlflow(tmp_path, monkeypatch):
-    (tmp_path / "filetest-1.0.dist-info").mkdir()
-    (tmp_path / "filetest-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: filetest\nVersion: 1.0\n")
-    (tmp_path / "filetest-1.0.dist-info/entry_points.txt").write_text("[mlflow.tracking_store]\nfiletest = filetest:t\n")
-    with pytest.raises(TrackingError, match="^filetest://x: not a tracking address"):
+    plugin = tmp_path / "filetest-1.0.dist-info"
+    plugin.mkdir()
+    (plugin / "METADATA").write_text("Metadata-Version: 2.1\nName: filetest\nVersion: 1.0\n")
+    (plugin / "entry_points.txt").write_text("[mlflow.tracking_store]\nfiletest = filetest:tracking\n")
+    with pytest.raises(TrackingError, match=r"^filetest://x: not a tracking address"):
         check_uri("filetest://x")
     monkeypatch.syspath_prepend(tmp_path)
     for uri in ("databricks", "databricks://profile", "filetest://x"):
