@@ -139,31 +139,26 @@ def stand_ins(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture
-def cluster() -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
-    """Start a Ray node as its users do: a head, or with the head's address another one. All on this machine.
-
-    Keywords but `address` are set in its environment.
-    """
+def cluster() -> Iterator[Callable[..., str]]:
+    """Start a Ray cluster of so many CPUs, as users do; keywords are set in its environment. Returns its address."""
     from tracked import free_port
 
     with contextlib.ExitStack() as stack:
 
-        def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
-            port, where = free_port(), [f"--address={address}"]
-            if not address:
-                # In a user's own, `ray start` would name another head as the current one; paths of sockets are short.
-                kept = tempfile.TemporaryDirectory(prefix="gridsim-", dir="/tmp", ignore_cleanup_errors=True)
-                where = ["--head", f"--port={port}", "--include-dashboard=false"]
-                where.append(f"--temp-dir={stack.enter_context(kept)}")
+        def head(cpus: int, **environment: str) -> str:
+            # In a user's own, `ray start` would name another head as the current one; paths of sockets are short.
+            kept = tempfile.TemporaryDirectory(prefix="gridsim-", dir="/tmp", ignore_cleanup_errors=True)
+            address, folder = f"127.0.0.1:{free_port()}", stack.enter_context(kept)
+            flags = f"--head --port={address.partition(':')[2]} --include-dashboard=false --temp-dir={folder}"
+            flags += f" --block --num-cpus={cpus} --object-store-memory=100000000"
             process = subprocess.Popen(
-                [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}", "--object-store-memory=100000000", *where],
+                [str(BIN / "ray"), "start", *flags.split()],
                 env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | environment,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )
             stack.callback(end, process)
-            if not address:
-                wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
-            return address or f"127.0.0.1:{port}", process
+            wait_until(lambda: answers(address), 60)
+            return address
 
-        yield node
+        yield head

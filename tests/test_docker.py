@@ -110,27 +110,17 @@ def test_the_user_compiles_all_kernels_from_sources_of_whole_seconds_and_there_i
         settings.check()
 
 
-def test_compose_is_one_image_of_this_version_with_ports_on_loopback_alone() -> None:
+def test_compose_is_one_image_of_this_version_with_a_token_and_ports_on_loopback_alone() -> None:
     services = compose()["services"]
     for service in services.values():
         assert service["image"] == f"gridsim:{PROJECT['project']['version']}"
         assert service["build"] == {"context": "..", "dockerfile": "docker/Dockerfile"}
         assert service["healthcheck"]["test"][0] == "CMD"
         assert service.keys().isdisjoint({"privileged", "network_mode"})
+        if "ray start" in service["command"]:
+            assert service["environment"].items() >= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN}.items()
     ports = {name: service["ports"] for name, service in services.items() if "ports" in service}
     assert ports == {"mlflow": ["127.0.0.1:5000:5000"]}
-
-
-def test_every_node_of_ray_has_the_token_and_room_for_its_store() -> None:
-    text = (ROOT / "docker/compose.yaml").read_text(encoding="utf-8")
-    assert "RAY_AUTH_TOKEN: ${RAY_AUTH_TOKEN:?" in text, "no token of ours, and none is an error"
-    for name in ("head", "worker"):
-        service = compose()["services"][name]
-        assert service["environment"].items() >= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": TOKEN}.items()
-        (store,) = re.findall(r"--object-store-memory=(\d+)", service["command"])
-        assert service["shm_size"] == "1gb"
-        assert int(store) < 2**30
-    assert "RAY_AUTH_TOKEN" not in str(compose()["services"]["mlflow"])
 
 
 def test_the_guides_commands_are_read_by_the_real_parser() -> None:

@@ -35,9 +35,9 @@ ELSEWHERE = {
     ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_follow_takes_the_newest_elite",
     ".venv/bin/gridsim-drive --scenario city --record drive.csv": "tests/gridsim/test_drive.py::test_real_keys_drive",
     ".venv/bin/gridsim-watch drive.csv": "tests/cluster/test_watch.py::test_watch_shows_a_recorded_drive",
-    "ray start --head": "tests/conftest.py::node",
-    "ray start --address <first>:6379": "tests/conftest.py::node",
-    "gridsim-evolve --address auto": "tests/cluster/test_faults.py::test_hosts_come_and_go",
+    "ray start --head": "tests/conftest.py::head",
+    "ray start --address <first>:6379": "tests/cluster/test_cluster.py::up",
+    "gridsim-evolve --address auto": "tests/cluster/test_cli.py::test_a_run_goes_on_in_any_mode",
 }
 # What makes the Python examples of README.md and docs/ small, and names runs that are there.
 IN_PYTHON = {

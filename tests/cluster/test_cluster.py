@@ -23,7 +23,6 @@ from packaging.requirements import Requirement
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
-from cluster.compare.plan import Plan
 from cluster.workers.ray_session import PACKAGES
 from gridsim import evolve
 from gridsim.jit import CACHE_FOLDER
@@ -215,16 +214,6 @@ def test_the_same_run_as_a_job(up: Machines) -> None:
     alone = evolve(scenario="curved", traffic=2, population=48, seed=5, generations=6)[0]
     assert summary(up.head.home / "runs/j")["champion_sha256"] == alone.sha256
     assert all_in_mlflow(up.head.home / "runs/j")
-
-
-@pytest.mark.e2e
-def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
-    plan = Plan(("curved",), ("evolution",), 2, budget="1G", population=48, generations=6)
-    asked = "--scenarios curved --learners evolution --seeds 2 --budget 1G --population 48 --generations 6 --name c"
-    command = f"gridsim-compare --address auto --jobs 2 --workers 1 {asked}"
-    up.laptop.run(RAY, "exec", up.config, command, timeout=UP_S)
-    for run in plan.planned(up.head.home / "runs/c"):
-        assert summary(run.path)["champion_sha256"] == evolve(**vars(run.settings))[0].sha256
 
 
 @pytest.mark.e2e

@@ -1,10 +1,6 @@
 """Workers are counted from the cores that this process may use: affinity, and the quotas of containers."""
 
-import os
-import subprocess
-
 import pytest
-from commands import BIN
 
 from cluster.workers import cores as module
 from cluster.workers.cores import cores
@@ -39,15 +35,3 @@ def test_the_quota_of_a_container_counts(groups, files, count, tmp_path, monkeyp
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"{content}\n")
     assert cores(tmp_path) == count
-
-
-@pytest.mark.e2e
-@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, for a mount of its own")
-def test_a_process_counts_cores_by_its_quota():
-    groups = "/sys/fs/cgroup"
-    asked = f"mount -t tmpfs none {groups} && echo 100000 100000 > {groups}/cpu.max && {BIN}/python -c "
-    asked += "'from cluster.workers.cores import cores; print(cores())'"
-    done = subprocess.run(["unshare", "--mount", "sh", "-c", asked], capture_output=True, text=True, check=False)
-    if "unshare" in done.stderr or "mount" in done.stderr:
-        pytest.skip(f"no mount of its own: {done.stderr}")
-    assert done.stdout == "1\n", done.stderr

@@ -75,34 +75,6 @@ def test_a_server_that_is_away_before_while_and_after_a_run(served, tmp_path, im
         assert before == [query(tmp_path / "served.db", f"SELECT * FROM {table}") for table in TABLES]
 
 
-def test_a_server_that_is_killed_again_and_again_while_it_is_sent_to(served, tmp_path, monkeypatch, impatient):
-    """Between any two requests of a run's end; at first it is not there at all."""
-    uri, server = served
-    folder, lacking, kills = write_run(tmp_path / "a", 4, success_rate=0.5), "all", 0
-    assert str(tracking(folder, uri).close("FINISHED")).endswith("the status FINISHED: Connection refused")
-    assert str(sync(folder, "", "", read_run)[1]).endswith(": Connection refused")
-    import requests
-
-    real = requests.Session.request
-    left = 0
-
-    def request(self, method, url, **options):
-        nonlocal left
-        left -= 1
-        if left < 0 and url.startswith(uri):
-            raise requests.ConnectionError("[Errno 111] Connection refused")
-        return real(self, method, url, **options)
-
-    with server():
-        monkeypatch.setattr(requests.Session, "request", request)
-        while lacking:
-            left, kills = 8 + kills, kills + 1
-            lacking = sync(folder, uri, "driving", read_run)[1] or ""
-        left = 1000
-        assert kills > 2
-        check_complete(uri, folder, 4, send(folder, uri)[1])
-
-
 def test_files_of_a_server_that_does_not_serve_them(served, tmp_path, impatient):
     uri, server = served
     folder, root = write_run(tmp_path / "a", 2, success_rate=0.5), tmp_path / "srv/files"

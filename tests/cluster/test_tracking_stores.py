@@ -5,32 +5,18 @@ import os
 import re
 import sqlite3
 import urllib.request
-from pathlib import Path
 
 import pytest
 import requests
 from commands import finish
-from tracked import PYTHONPATH, QUIET, free_port, runs, send, tracking, write_run
+from tracked import free_port, send, tracking, write_run
 
-from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_path, sqlite_uri
+from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_uri
 from cluster.tracking.database import run_tables
 from cluster.tracking.description import read_run
 from cluster.tracking.tracking import Tracking
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
-
-
-@pytest.mark.parametrize("name", ["what now?", "a#b", "a%41b", "a;b&c", "it's", '"quoted"', "[old]", "ü", "a?b=c/d"])
-def test_the_address_of_a_database_in_an_odd_folder(tmp_path, monkeypatch, name):
-    (tmp_path / name).mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / name)
-    uri, path = check_uri(), tmp_path / name / "mlflow.db"
-    assert sqlite_path(uri) == path
-    assert check_uri(uri) == check_uri(f"sqlite:///{path}") == uri
-    assert sqlite_uri(path, "timeout=9") == check_uri("sqlite:///mlflow.db?timeout=9")
-    from sqlalchemy.engine import make_url
-
-    assert make_url(uri).database == str(path)
 
 
 def test_a_run_in_a_folder_with_an_odd_name(tmp_path, monkeypatch):
@@ -70,47 +56,17 @@ def test_a_database_of_another_mlflow_is_refused_before_it_is_migrated(tmp_path,
     assert sorted(os.listdir(tmp_path)) == ["a", "mlflow.db"]
 
 
-PLUGIN = """
-def tracking(store_uri, artifact_uri):
-    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
-
-    folder = store_uri.removeprefix("filetest://")
-    return SqlAlchemyStore(f"sqlite:///{folder}/hosted.db", f"{folder}/files")
-
-def registry(store_uri, **_):
-    from mlflow.store.model_registry.sqlalchemy_store import SqlAlchemyStore
-
-    return SqlAlchemyStore(f"sqlite:///{store_uri.removeprefix('filetest://')}/hosted.db")
-"""
-
-
-@pytest.mark.e2e
-def test_a_run_in_the_store_of_a_plug_in(tmp_path):
-    plugin, hosted, cwd = (tmp_path / name for name in ("plugin", "hosted", "cwd"))
-    for folder in (plugin / "filetest-1.0.dist-info", hosted, cwd):
-        folder.mkdir(parents=True)
-    (plugin / "filetest.py").write_text(PLUGIN)
-    (plugin / "filetest-1.0.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: filetest\nVersion: 1.0\n")
-    (plugin / "filetest-1.0.dist-info/entry_points.txt").write_text(
-        "[mlflow.tracking_store]\nfiletest = filetest:tracking\n"
-        "[mlflow.model_registry_store]\nfiletest = filetest:registry\n"
-    )
-    uri = f"filetest://{hosted}"
-    with pytest.raises(TrackingError, match=f"^{uri}: not a tracking address"):
-        check_uri(uri)
-    script = [*("python", "-c", QUIET, uri, str(tmp_path / "a")), "good"]
-    finish(*script, cwd=cwd, PYTHONPATH=f"{PYTHONPATH}{os.pathsep}{plugin}")
-    assert os.listdir(cwd) == []
-    (run,) = runs(f"sqlite:///{hosted}/hosted.db")
-    assert run.info.status == "FINISHED"
-    assert run.info.artifact_uri.startswith(f"{hosted}/files/")
-    assert Path(run.info.artifact_uri, "model/MLmodel").is_file()
-
-
-@pytest.mark.parametrize("uri", ["databricks", "databricks://profile"])
-def test_hosted_stores_are_left_to_mlflow(uri, tmp_path):
-    assert check_uri(uri) == check_uri(begun_with=uri) == uri
-    assert Tracking(tmp_path, uri, "", read_run).where("mlflow") == uri
+def test_hosted_stores_and_those_of_plug_ins_are_left_to_mlflow(tmp_path, monkeypatch):
+    plugin = tmp_path / "filetest-1.0.dist-info"
+    plugin.mkdir()
+    (plugin / "METADATA").write_text("Metadata-Version: 2.1\nName: filetest\nVersion: 1.0\n")
+    (plugin / "entry_points.txt").write_text("[mlflow.tracking_store]\nfiletest = filetest:tracking\n")
+    with pytest.raises(TrackingError, match=r"^filetest://x: not a tracking address"):
+        check_uri("filetest://x")
+    monkeypatch.syspath_prepend(tmp_path)
+    for uri in ("databricks", "databricks://profile", "filetest://x"):
+        assert check_uri(uri) == check_uri(begun_with=uri) == uri
+        assert Tracking(tmp_path, uri, "", read_run).where("mlflow") == uri
 
 
 @pytest.mark.parametrize(
