@@ -183,8 +183,3 @@ def is_finished(run: RunFolder) -> bool:
     """Whether nothing is left to do: learning has ended by these settings, and all files are there."""
     there = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION))
     return run.saved is not None and there and run.settings.ended(run.saved[1])
-
-
-def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write summary.json, the mark of a finished run."""
-    checkpoint.write_json(folder / SUMMARY, summary)
