@@ -63,8 +63,6 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
     path = Path(path)
     try:
         content = path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:  # the latter for a name with a null byte
         raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
     if content[-_DIGEST - len(_MARK) : -_DIGEST] != _MARK:
@@ -76,8 +74,6 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError("it holds more than arrays")
         header = json.loads(arrays.pop("meta").tobytes().decode())
         if (header["format"], header["version"]) != ("gridsim", VERSION):
             raise ValueError(f"its format is not {VERSION}, which this GridSim reads")

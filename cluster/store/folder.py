@@ -126,8 +126,6 @@ def lock(path: Path) -> None:
 
 def open_run(folder: Path) -> RunFolder:
     """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError, CheckpointError."""
-    if not folder.is_dir():
-        raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
     path = folder.resolve()
@@ -168,8 +166,6 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     """
     if not name:
         name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
-        if (output / name).exists():
-            name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name

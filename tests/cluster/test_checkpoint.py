@@ -1,10 +1,8 @@
 """Saved whole or not at all; loaded as saved or refused with a CheckpointError."""
 
 import errno
-import io
 import json
 import os
-import pickle
 import resource
 import zipfile
 from hashlib import sha256
@@ -16,7 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from cluster.store import checkpoint
 from cluster.store.checkpoint import CheckpointError, load, save
 
 META = {"generation": 7, "history": [{"fitness/best": 0.1 + 0.2, "mean": float("-inf")}], "name": "Straße"}
@@ -44,28 +41,6 @@ def refused(path):
     assert "\n" not in text
     assert len(text) < len(str(path)) + 200
     return text
-
-
-def signed(members, path):
-    """Write an archive with the checksum that makes it look like one of ours; returns the path."""
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-        archive.comment = b"sha256:" + b"0" * 64
-    body = path.read_bytes()[:-64]
-    path.write_bytes(body + sha256(body).hexdigest().encode())
-    return path
-
-
-def npy(array):
-    stream = io.BytesIO()
-    np.lib.format.write_array(stream, array, allow_pickle=True)
-    return stream.getvalue()
-
-
-def meta_member(meta=META, version=checkpoint.VERSION, form="gridsim"):
-    text = json.dumps({"format": form, "version": version, "meta": meta})
-    return npy(np.frombuffer(text.encode(), np.uint8))
 
 
 def test_numpy_reads_it_too(saved):
@@ -111,41 +86,29 @@ def test_truncated_or_edited_at_any_byte(saved):
         refused(saved)
 
 
-def test_what_is_no_checkpoint(tmp_path, saved):
-    assert "no such file" in refused(tmp_path / "missing" / "checkpoint.npz")
+def test_what_is_no_checkpoint(tmp_path):
+    assert "No such file" in refused(tmp_path / "missing" / "checkpoint.npz")
     assert "Is a directory" in refused(tmp_path)
     (tmp_path / "text").write_text("generation,fitness\n")
     assert "not a GridSim file" in refused(tmp_path / "text")
     np.savez(tmp_path / "foreign.npz", genome=np.zeros(3))
     assert "not a GridSim file" in refused(tmp_path / "foreign.npz")
-    with zipfile.ZipFile(saved, "a") as archive:
-        archive.writestr("more.npy", npy(np.zeros(3)))
-    assert "edited" in refused(saved)
-
-
-@pytest.mark.parametrize(
-    "member",
-    [
-        meta_member(version="newer\nand newer"),
-        meta_member(form="other"),
-        meta_member(meta=3),
-        npy(np.frombuffer(b"[" * 100_000, np.uint8)),
-        b"no array",
-    ],
-)
-def test_meta_that_is_not_ours(tmp_path, member):
-    assert "not a GridSim file" in refused(signed({"meta.npy": member}, tmp_path / "a.npz"))
 
 
 def test_a_pickle_is_refused_and_not_run(tmp_path):
+    """Also with the checksum that makes it look like one of ours."""
+
     class Payload:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "was-run"),)
 
-    members = {"meta.npy": meta_member(), "x.npy": npy(np.array([Payload()], object))}
-    refused(signed(members, tmp_path / "object-array.npz"))
-    members["x.npy"] = pickle.dumps(Payload())
-    refused(signed(members, tmp_path / "bare-pickle.npz"))
+    path, payload = tmp_path / "a.npz", np.array([Payload()], object)
+    np.savez(path, x=payload)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.comment = b"sha256:" + b"0" * 64
+    body = path.read_bytes()[:-64]
+    path.write_bytes(body + sha256(body).hexdigest().encode())
+    assert "not a GridSim file" in refused(path)
     assert not (tmp_path / "was-run").exists()
 
 
