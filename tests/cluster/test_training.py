@@ -80,14 +80,6 @@ def test_a_search_is_what_was_asked_for(maps):
         assert len(search.ask().groups) == 2
 
 
-def test_a_run_may_begin_with_a_champion(maps):
-    genome = np.random.default_rng(3).normal(size=GENES).astype(np.float32)
-    for settings in (SETTINGS, TWO):
-        evolution = Evolution(settings, pool_of(maps), maps, genome)
-        step(evolution)
-        assert evolution.elites[0].tobytes() == genome.tobytes()
-
-
 @pytest.mark.parametrize(("settings", "after"), [(SETTINGS, 0), (SETTINGS, 2), (TWO, 2)])
 def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps, settings, after):
     """Also with the leader beside them: results are those of each driving alone."""
