@@ -26,7 +26,7 @@ from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.store import checkpoint
 from cluster.store.champion import Champion
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
-from cluster.store.folder import ONNX, RunError, RunFolder, lock, write_summary
+from cluster.store.folder import ONNX, RunError, RunFolder, lock
 from cluster.store.steps import Steps, write_elites
 from cluster.text import as_argument
 from cluster.tracking.description import read_run
@@ -234,4 +234,4 @@ class Session:
             **{f"best_{name}": row[name] for name in ("car_steps", "wall_s")},
             "held_out": summarise(driven.results[0], sim.episode.control_period),
         }
-        write_summary(path, self.summary)
+        checkpoint.write_json(path / SUMMARY, self.summary)

@@ -32,7 +32,6 @@ class RunSettings(ABC):
     """What any learner's run depends on: two runs with equal settings have the same champion."""
 
     command: ClassVar[str]  # console script of this learner
-    default_policies: ClassVar[dict[Observation, str]]
     extendable: ClassVar[tuple[str, ...]]  # limits that --resume may raise
     step_name: ClassVar[str]  # what a step of learning is called
     verb: ClassVar[str]  # what is done to a network
@@ -62,12 +61,13 @@ class RunSettings(ABC):
             object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
         if self.traffic == -1:
             object.__setattr__(self, "traffic", default_traffic(self.scenario))
-        if not self.policy:
-            object.__setattr__(self, "policy", self.default_policy())
+        for name, value in self.defaults().items():
+            if not getattr(self, name):
+                object.__setattr__(self, name, value)
 
-    def default_policy(self) -> str:
-        """The network that suits the observation."""
-        return self.default_policies.get(self.observation, "")
+    @abstractmethod
+    def defaults(self) -> dict[str, Any]:
+        """What 0 and "" stand for in these settings."""
 
     @property
     @abstractmethod
@@ -112,12 +112,9 @@ class RunSettings(ABC):
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
-        try:
-            spec = PolicySpec.parse(self.policy)
-        except ValueError as error:
-            raise GridSimError(str(error)) from error
+        spec = PolicySpec.parse(self.policy)
         if spec.observation != self.observation:
-            remedy = f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
+            remedy = f"give --observation {spec.observation}, or a policy such as {self.defaults()['policy']}"
             raise GridSimError(f"policy {self.policy} sees the {spec.observation}; {remedy}")
 
     def _check_range(self, least: float, most: float, *names: str) -> None:
@@ -137,7 +134,6 @@ class EvolveSettings(RunSettings):
     """What an evolution run depends on."""
 
     command: ClassVar[str] = "gridsim-evolve"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64+steering", "grid": "cnn:8,16,32@1"}
     extendable: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     step_name: ClassVar[str] = "generation"
     verb: ClassVar[str] = "evolving"
@@ -165,16 +161,14 @@ class EvolveSettings(RunSettings):
     search: Literal["evolution", "random"] = "evolution"
     """evolution, or random: new random genomes in each generation, as a baseline."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.population:
-            object.__setattr__(self, "population", 128 if self.traffic else SearchConfig.population)
-        if not self.generations and not self.car_steps:
-            object.__setattr__(self, "car_steps", 60_000_000 if self.traffic else 30_000_000)
-
-    def default_policy(self) -> str:
-        usual = super().default_policy()
-        return usual.replace("+", "+motion+") if self.traffic and self.observation == "rays" else usual
+    def defaults(self) -> dict[str, Any]:
+        alone = not self.traffic
+        rays = "mlp:64+steering" if alone else "mlp:64+motion+steering"
+        return {
+            "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
+            "population": SearchConfig.population if alone else 128,
+            "car_steps": 0 if self.generations else 30_000_000 if alone else 60_000_000,
+        }
 
     @property
     def algorithm(self) -> str:
@@ -222,22 +216,9 @@ class DqnSettings(RunSettings):
     """What a run of the DQN depends on."""
 
     command: ClassVar[str] = "gridsim-dqn"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
     extendable: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
     step_name: ClassVar[str] = "evaluation"
     verb: ClassVar[str] = "training"
-    #: What 0 means in these settings. An update on grids takes a hundred times as long as one on rays,
-    #: so that half an hour is enough for 2 million car-steps, not 400 million.
-    defaults_by_observation: ClassVar[dict[Observation, dict[str, Any]]] = {
-        "rays": {
-            "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3, "anneal": 30_000_000,
-            "target_period": 200, "evaluate_every": 1_000_000,
-        },
-        "grid": {
-            "replay": 100_000, "batch": 64, "updates": 16.0, "learning_rate": 5e-4, "anneal": 4_000_000,
-            "target_period": 500, "evaluate_every": 250_000,
-        },
-    }  # fmt: skip
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network of the Q function: mlp: and the sizes of its hidden layers, +steering to see its own steering
@@ -274,11 +255,18 @@ class DqnSettings(RunSettings):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the learner computes: auto, cpu or cuda."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, value in self.defaults_by_observation.get(self.observation, {}).items():
-            if not getattr(self, name):
-                object.__setattr__(self, name, value)
+    def defaults(self) -> dict[str, Any]:
+        # An update on grids takes a hundred times as long as one on rays, so that half an hour is enough for 2 million
+        # car-steps, not 400 million.
+        if self.observation == "grid":
+            return {
+                "policy": "cnn:16,32,256@4", "replay": 100_000, "batch": 64, "updates": 16.0, "learning_rate": 5e-4,
+                "anneal": 4_000_000, "target_period": 500, "evaluate_every": 250_000,
+            }  # fmt: skip
+        return {
+            "policy": "mlp:64,64+steering", "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3,
+            "anneal": 30_000_000, "target_period": 200, "evaluate_every": 1_000_000,
+        }  # fmt: skip
 
     @property
     def algorithm(self) -> str:

@@ -39,8 +39,8 @@ from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.stopping import INTERRUPTED
 from cluster.store.champion import evaluate, load_champion
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError
-from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config, write_summary
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError, write_json
+from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
@@ -237,7 +237,7 @@ def _send_missing(console: Console, run: RunFolder, meta: Mapping[str, Any], wor
     sent, unsent = sync(run.path, work.tracking_uri, work.experiment, read_run)
     if sent:  # perhaps MLflow was away as the run ended
         summary = json.loads((run.path / SUMMARY).read_bytes())
-        write_summary(run.path, summary | {"mlflow_run_id": saved_run_id(run.path)})
+        write_json(run.path / SUMMARY, summary | {"mlflow_run_id": saved_run_id(run.path)})
     done = f"sent to MLflow: {sent}" if sent else "nothing to do"
     limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
     more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""

@@ -17,9 +17,8 @@ from cluster.settings import EvolveSettings
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.figures import mean_speed
-from evolution.episodes.starts import Episodes
 from evolution.search import fitness
-from evolution.search.base import Generation, Search
+from evolution.search.base import Search
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
@@ -63,7 +62,7 @@ class Evolution(Learning):
         """Evolve one generation."""
         curriculum, period = self.curriculum, self.sim.episode.control_period
         leader = self.search.leader()
-        candidate = leader if self._promising() else None
+        promising = self._promising()
         self.search.champion = self.champion.genome if self.champion else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.steps)
         e = len(episodes.rows) // len(asked.groups)
@@ -71,13 +70,15 @@ class Evolution(Learning):
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.steps + AHEAD)])
 
-        call = _Call(asked, episodes, list(groups))
-        if leader is not None:
+        members, alone = asked, list[Chunk]()
+        if leader is not None:  # it drives its own episodes, and as a candidate those of validation
             followed = curriculum.leader_episodes(self.steps)
-            leading = call.add(leader, followed)
-        if candidate is not None:
-            trial = call.add(candidate, curriculum.validation())
-        driven = yield from self._evaluate("evolve", call.members, call.episodes, call.asked)
+            members = asked.and_copies(leader[None])
+            row = slice(len(asked.recipes), len(members.recipes))
+            for own in (followed, curriculum.validation()) if promising else (followed,):
+                first, episodes = len(episodes.rows), episodes.and_then(own)
+                alone.insert(0, Chunk(row, slice(first, len(episodes.rows))))
+        driven = yield from self._evaluate("evolve", members, episodes, [*alone, *groups])  # the longest first
         results = np.concatenate([driven.results[part] for part in groups])
         score = self._score(results, goals)
         curriculum.learn_from_members(self.steps, [driven.results[part] for part in groups])
@@ -88,13 +89,12 @@ class Evolution(Learning):
             led, led_score = results[best], float(score[best])
         else:
             self.elites[self.steps] = leader
-            led = driven.results[leading][0]
+            led, columns = driven.results[alone[-1]][0], alone[-1].columns
             led_score = float(self._score(led[None], float(followed.rows["target"][0]))[0])
-            columns = leading.columns
             curriculum.learn_from_leader(followed, led, driven.rewound[columns], driven.worlds[columns])
         self.search.tell(score)
-        if candidate is not None:
-            self._judge(candidate, driven.results[trial], self.steps - 1)
+        if leader is not None and promising:
+            self._judge(leader, driven.results[alone[0]], self.steps - 1)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         self.history.append({
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
@@ -115,10 +115,9 @@ class Evolution(Learning):
 
     def _promising(self) -> bool:
         """Whether to validate the candidate: the leader does well, and validation has not had more than its share."""
-        config = self.curriculum.config
+        config, candidate = self.curriculum.config, self.candidate()
         latest = [row["leader/success_rate"] for row in self.history[-config.latest :]]
         least = max(config.promising, self.champion.success_rate if self.champion else 0.0)
-        candidate = self.candidate()
         return (
             candidate is not None
             and (self.tried is None or self.tried.tobytes() != candidate.tobytes())
@@ -142,20 +141,3 @@ class Evolution(Learning):
         for name in CRASHES:
             setattr(self.curriculum, name, arrays[name])
         self.curriculum.target = meta["target"]
-
-
-@dataclass
-class _Call:
-    """What one call of the pool drives: members on their groups' episodes, and single genomes on their own."""
-
-    members: Generation
-    episodes: Episodes
-    asked: list[Chunk]
-
-    def add(self, genome: np.ndarray, episodes: Episodes) -> Chunk:
-        """Drive a genome float32 [genes] on episodes; they are sent first, since they take longest."""
-        n, e = len(self.members.recipes), len(self.episodes.rows)
-        part = Chunk(slice(n, n + 1), slice(e, e + len(episodes.rows)))
-        self.members, self.episodes = self.members.and_copies(genome[None]), self.episodes.and_then(episodes)
-        self.asked.insert(0, part)
-        return part

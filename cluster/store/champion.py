@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cluster.settings import MAX_TRAFFIC, EvolveSettings
+from cluster.settings import MAX_TRAFFIC
 from cluster.store import checkpoint
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.store.folder import read_config
@@ -97,7 +97,8 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
     """
     path = Path(path)
     if os.path.isdir(path):  # path.is_dir() raises for a name that is too long
-        _check_finished(path)
+        if not (path / CHAMPION).exists():
+            raise _missing(path)
         path /= CHAMPION
     arrays, meta = checkpoint.load(path)
     if "genome" not in arrays:
@@ -123,20 +124,15 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
 
 
-def _check_finished(run: Path) -> None:
-    """Raises: CheckpointError if a folder has no champion.npz."""
-    if (run / CHAMPION).exists():
-        return
+def _missing(run: Path) -> CheckpointError:
+    """Why a folder has no champion, and what to do."""
     if not (run / CONFIG).is_file():
-        raise CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
-    try:
-        command = read_config(run / CONFIG)[0].command
-    except GridSimError:
-        command = EvolveSettings.command
+        return CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
+    command = read_config(run / CONFIG)[0].command
     again = f"continue it with: {command} --resume {as_argument(run)}"
     if not (run / CHECKPOINT).is_file():
         again = f"start it anew with: {command} --config {as_argument(run / CONFIG)}"
-    raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
+    return UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
 
 def evaluate(

@@ -126,8 +126,6 @@ def lock(path: Path) -> None:
 
 def open_run(folder: Path) -> RunFolder:
     """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError, CheckpointError."""
-    if not folder.is_dir():
-        raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
     path = folder.resolve()
@@ -168,8 +166,6 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     """
     if not name:
         name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
-        if (output / name).exists():
-            name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name
@@ -183,8 +179,3 @@ def is_finished(run: RunFolder) -> bool:
     """Whether nothing is left to do: learning has ended by these settings, and all files are there."""
     there = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION))
     return run.saved is not None and there and run.settings.ended(run.saved[1])
-
-
-def write_summary(folder: Path, summary: dict[str, Any]) -> None:
-    """Write summary.json, the mark of a finished run."""
-    checkpoint.write_json(folder / SUMMARY, summary)

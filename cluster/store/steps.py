@@ -61,7 +61,7 @@ class Steps:
         """Write history.csv with further rows, float64 [n, columns]. Raises: WriteError."""
         for row in rows.tolist():
             self._history.append(",".join([str(len(self._history) - 1), *map(repr, row)]))
-        checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode(), durable=False)
+        checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode())
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:

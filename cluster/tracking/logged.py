@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cluster.redaction import one_line, redacted
-from cluster.store.checkpoint import MLFLOW, write_atomic
+from cluster.store.checkpoint import MLFLOW, write_json
 from cluster.text import count
 from cluster.tracking.address import TrackingError, is_database, sqlite_path, unreachable
 from cluster.tracking.commit import git_commit
@@ -285,4 +285,4 @@ def read_link(folder: Path) -> dict[str, Any]:
 
 
 def _write_link(folder: Path, link: dict[str, Any]) -> None:
-    write_atomic(folder / MLFLOW, (json.dumps(link, indent=2) + "\n").encode(), durable=False)
+    write_json(folder / MLFLOW, link)

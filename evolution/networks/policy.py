@@ -18,6 +18,7 @@ import numpy as np
 
 from evolution.networks.dense import tile
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 from gridsim.jit import F, U, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
@@ -44,27 +45,27 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises ValueError otherwise."""
+        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises GridSimError otherwise."""
         if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
             sizes = tuple(int(n) for n in match[1].split(","))
             spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
             if min(sizes) < 1:
-                raise ValueError(f"policy {text!r}: hidden layers need 1 unit or more")
+                raise GridSimError(f"policy {text!r}: hidden layers need 1 unit or more")
         elif match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
             hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
             spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
             if any(n < UNIT_MULTIPLE or n % UNIT_MULTIPLE for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
-                raise ValueError(
+                raise GridSimError(
                     f"policy {text!r}: layers of a cnn need a positive multiple of {UNIT_MULTIPLE} units, "
                     f"and it sees 1 to {MAX_FRAMES} frames"
                 )
         else:
-            raise ValueError(
+            raise GridSimError(
                 f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
                 "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
             )
         if spec.size > MAX_GENES:
-            raise ValueError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
+            raise GridSimError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
         return spec
 
     @property

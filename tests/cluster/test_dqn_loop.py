@@ -36,13 +36,6 @@ def loop(maps, monkeypatch):
     return make
 
 
-def test_a_replay_smaller_than_the_warm_up_is_learned_from(loop):
-    learning = loop(replay=1000)
-    step(learning)
-    step(learning)
-    assert learning.learner.updates > 0
-
-
 def test_a_network_that_learned_nothing_is_evaluated_again_and_has_not_converged(loop):
     learning = loop(updates=1e-6)
     evaluated = [step(learning) for _ in range(dqn_loop.STABLE + 2)]
@@ -90,13 +83,6 @@ def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop):
     with pytest.raises(FloatingPointError, match=r"^the Q network diverged at update \d+: try a lower learning rate$"):
         step(learning)
     assert len(learning.history) == 1
-
-
-def test_a_step_ends_early_when_time_is_up(loop):
-    learning = loop(evaluate_every=10**9)
-    learning.deadline = 0.0
-    step(learning)
-    assert learning.batches == 1
 
 
 @pytest.mark.parametrize(("name", "most"), [("car_steps", 5000), ("episodes", 200)])

@@ -88,7 +88,7 @@ def test_a_name_is_no_markup_and_its_spaces_stay(tmp_path, monkeypatch, capsys):
     shutil.copy(CHAMPION, tmp_path / "x[/b]:car:")
     code, out, _ = call(evaluate_main, monkeypatch, capsys, "x[/b]:car:", "--episodes", 1)
     assert (code, out.partition(" on ")[0]) == (0, "x[/b]:car:")
-    assert "no  such: no such folder" in refused(evolve_main, monkeypatch, capsys, "--resume", "no  such")[0]
+    assert "no  such is not a run's folder" in refused(evolve_main, monkeypatch, capsys, "--resume", "no  such")[0]
 
 
 @pytest.mark.parametrize(
