@@ -41,10 +41,11 @@ WATCH, DRIVE = "gridsim-watch", "gridsim-drive"
 HINTS: dict[type[GridSimError], str] = {
     NoDisplayError: "to write a page or a film in place of a window: --output drive.html, or film.mp4",
     UnfinishedError: "to watch it as it stands: --follow, or --generation N",
+    RunError: "--generation and --follow need a run's folder",
     CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
 }
 FILM_S = 60.0  # s of a film by default
-FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place
+FOLLOW_S = 20.0  # s that an elite is followed before the newest one takes its place
 LINGER_S = 1.5  # s that the last picture of a drive stays
 
 
@@ -131,11 +132,12 @@ def _watch() -> int:
     stopping.listen()
     if not 0 <= flags.fps <= 120:
         raise GridSimError(f"--fps must be 1 to 120, not {flags.fps}")
-    size, seconds = _size_and_seconds(
-        flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic
-    )
+    usual = "640x360" if flags.output else "960x640"
+    size, seconds = _size_and_seconds(flags.size or usual, flags.seconds, flags.traffic)
     if flags.scenario:
         check_name(flags.scenario)
+    if flags.follow and (flags.output or flags.generation is not None):
+        raise GridSimError("--follow shows the newest elite in a window; leave out --output and --generation")
     output = Path(flags.output)
     suffix = output.suffix.lower()
     if flags.beside and suffix != ".html":
@@ -155,22 +157,16 @@ def _watch() -> int:
     return 0
 
 
-def checkpoint_time(run: Path) -> int:
-    """When a run's checkpoint was written, ns; 0 if there is none yet."""
-    try:
-        return (run / CHECKPOINT).stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
-    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and its title.
-
-    Raises: GridSimError.
-    """
+def _elite(run: Path, generation: int | None) -> tuple[Champion, str]:
+    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and its name."""
     settings, _ = read_config(run / CONFIG)
-    genomes = read_elites(run, settings.policy)
     step = settings.step_name
+    if generation is None and not (run / CHECKPOINT).exists():
+        print(f"waiting for the first {step} ...", flush=True)
+        while not (run / CHECKPOINT).exists():
+            stopping.check()
+            time.sleep(0.1)
+    genomes = read_elites(run, settings.policy)
     number = len(genomes) - 1 if generation is None else generation
     if not 0 <= number < len(genomes):
         raise GridSimError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
@@ -178,50 +174,27 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     return champion, f"elite of {step} {number}"
 
 
-def _driver(flags: WatchFlags) -> tuple[Champion, str]:
-    """The next drive's driver and its title. Raises GridSimError."""
-    source, of_run = Path(flags.source), flags.generation is not None or flags.follow
-    if flags.generation is not None and flags.follow:
-        raise GridSimError("--generation and --follow exclude each other; leave one out")
-    if of_run and source.is_file():
-        raise GridSimError(f"{source} holds one driver; give a run's folder with --generation or --follow")
-    if flags.follow and flags.output:
-        raise GridSimError("--follow needs a window; leave out --output, or film one elite with --generation")
-    if not source.exists():
-        raise GridSimError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
-    if of_run and not (source / CONFIG).is_file():
-        raise RunError(f"{source} is not a run's folder: it has no {CONFIG}")
-    if flags.follow and not checkpoint_time(source):
-        print(f"waiting for the first {read_config(source / CONFIG)[0].step_name} ...", flush=True)
-        while not checkpoint_time(source):
-            stopping.check()
-            time.sleep(0.1)
-    return elite(source, flags.generation) if of_run else (load_champion(source), "champion")
+def _is_recording(source: str) -> bool:
+    return source.lower().endswith(".csv") and not Path(source).is_dir()
 
 
-def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator[tuple[Recording, str]]:
-    """Yield drives and their titles: a recorded drive's episodes, else so many of a champion. Raises GridSimError."""
-    if _is_recording(flags):
+def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
+    """Yield drives and who drives: a recording's episodes, else a champion or an elite, in a window without end.
+
+    Raises: GridSimError.
+    """
+    if _is_recording(flags.source):
         yield from _recorded(flags)
         return
-    champion, name = _driver(flags)
-    for seed in itertools.islice(itertools.count(flags.seed), most):
-        if flags.follow:
-            champion, name = _driver(flags)
+    source = Path(flags.source)
+    for seed in itertools.count(flags.seed) if not flags.output else (flags.seed,):
+        elite = flags.follow or flags.generation is not None
+        champion, name = _elite(source, flags.generation) if elite else (load_champion(source), "champion")
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
         traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
         world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim)[0]
-        yield record(champion, scenario, start, seconds, world), f"{name}    {_name(scenario)}"
-
-
-def _name(road: Map) -> str:
-    """A road in words; a map file has only one."""
-    return label(road.name) + ("" if is_map_file(road.name) else f", map {road.seed:,}")
-
-
-def _is_recording(flags: WatchFlags) -> bool:
-    return flags.source.lower().endswith(".csv") and not Path(flags.source).is_dir()
+        yield record(champion, scenario, start, seconds, world), name
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
@@ -233,52 +206,52 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     recorded, config = read_drive(flags.source), SimConfig()
     scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
     _, cars, ranges, worlds = replay(recorded, scenario)
-    title = f"{Path(flags.source).name}    {_name(scenario)}"
-    episodes = int(recorded.episodes[-1]) + 1
-    for episode in range(episodes):
+    for episode in range(int(recorded.episodes[-1]) + 1):
         own, period = recorded.episodes == episode, config.episode.control_period
         drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, period)
-        yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
+        yield drive, f"episode {episode + 1}"
+
+
+def _title(drive: Recording, name: str) -> str:
+    """Who drives where; a map file has only one map."""
+    road = drive.scenario
+    return f"{name}    {label(road.name)}" + ("" if is_map_file(road.name) else f", map {road.seed:,}")
 
 
 def _page(flags: WatchFlags, output: Path, limit: float) -> None:
     """Write a page: drives of all sources from the same start, on the same road."""
     shown: list[Shown] = []
-    for source in (flags.source, *flags.beside):
-        one = dataclasses.replace(flags, source=source)
-        recorded = _is_recording(one)
+    sources = (flags.source, *flags.beside)
+    for source in sources:
         path = Path(source).resolve()
-        name = path.parent.name if path.name == CHAMPION else path.name
-        for k, (found, title) in enumerate(_drives(one, limit), 1):
-            label = title if recorded else f"{title.partition('    ')[0]} of {source}"
-            mark = str(k) if not flags.beside else name if k == 1 else f"{name} {k}"
-            shown.append(Shown(label, mark, found))
-            if not recorded:  # the others drive on the same road, among as many cars
+        of = path.parent.name if path.name == CHAMPION else path.name
+        for k, (found, name) in enumerate(_drives(dataclasses.replace(flags, source=source), limit), 1):
+            mark = str(k) if not flags.beside else of if k == 1 else f"{of} {k}"
+            shown.append(Shown(f"{name} of {source}", mark, found))
+            if not _is_recording(source):  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
-    title = f"GridSim: {', '.join((flags.source, *flags.beside))} on {shown[0].drive.scenario.name}"
+    title = f"GridSim: {', '.join(sources)} on {shown[0].drive.scenario.name}"
     write_page(output, title, shown, SimConfig(), together=bool(flags.beside))
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
 def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) -> None:
     """Write a film."""
-    suffix = output.suffix.lower()
-    fps = flags.fps or (10 if suffix == ".gif" else 20)
-    if suffix == ".gif" and 100 % fps:
+    gif = output.suffix.lower() == ".gif"
+    fps = flags.fps or (10 if gif else 20)
+    if gif and 100 % fps:
         raise GridSimError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
-    if not (flags.seconds or _is_recording(flags)):
+    if not (flags.seconds or _is_recording(flags.source)):
         limit = FILM_S
     drives = list(_drives(flags, limit))
-    seconds = min(limit, sum(drive.seconds for drive, _ in drives))
+    seconds = min(limit, sum(each.seconds for each, _ in drives))
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
-    pictures = _until_stopped(frames(renderer, drive, fps, title) for drive, title in drives)
-    console = new_console()
-    shown = track(
-        itertools.islice(pictures, total), f"filming {seconds:.0f} s of driving", total, console=console, transient=True
-    )
+    pictures = (each for drive, name in drives for each in frames(renderer, drive, fps, _title(drive, name)))
+    console, doing = new_console(), f"filming {seconds:.0f} s of driving"
+    shown = track(itertools.islice(pictures, total), doing, total, console=console, transient=True)
     count = write_video(output, shown, size, fps)
     end = drives[0][0].end
     how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
@@ -286,33 +259,22 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
     console.print(f"{output}: {seconds:.1f} s{how}, {count} pictures, {size_mb:.1f} MB", soft_wrap=True)
 
 
-def _until_stopped(drives: Iterator[Iterator[np.ndarray]]) -> Iterator[np.ndarray]:
-    """The pictures of drives, one after another. Raises Stopped."""
-    for pictures in drives:
-        for each in pictures:
-            stopping.check()
-            yield each
-
-
 def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     """Show drives in a window until it is closed."""
     fps = flags.fps or 30
-    run = Path(flags.source)
-    drives = _drives(flags, SimConfig().episode.time_limit, most=None)  # without end
+    drives = _drives(flags, FOLLOW_S if flags.follow else SimConfig().episode.time_limit)
     first = next(drives)  # raises errors before the window opens
     shown = 0.0
     with contextlib.closing(_Window(size, f"GridSim: {flags.source}")) as window:
-        for drive, title in itertools.chain([first], drives):
-            before = checkpoint_time(run)
-            renderer = Renderer(drive.scenario, size)
-            for k in range(round((drive.seconds + LINGER_S) * fps) + 1):
-                window.show(picture(renderer, drive, k / fps, title), fps)
+        for each, name in itertools.chain([first], drives):
+            renderer, title = Renderer(each.scenario, size), _title(each, name)
+            for k in range(round((each.seconds + LINGER_S) * fps) + 1):
+                window.show(picture(renderer, each, k / fps, title), fps)
                 shown += 1 / fps
                 pressed, _ = window.keys()
                 if window.closed or pressed & {"escape", "q"} or shown >= limit:
                     return
-                newer = flags.follow and k / fps >= FOLLOW_S and checkpoint_time(run) != before
-                if "n" in pressed or newer:
+                if "n" in pressed:
                     break
 
 

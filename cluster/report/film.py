@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import PIPE, Popen
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cluster import stopping
 from cluster.store.champion import Champion
 from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
@@ -30,10 +31,6 @@ CODING = {
     ".gif": "-filter_complex split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none:"
     "diff_mode=rectangle -f gif",
 }
-
-
-class VideoError(WriteError):
-    """A film that cannot be written; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -102,15 +99,16 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
 
 
 def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") -> Iterator[np.ndarray]:
-    """Pictures uint8 [h, w, 3] of a whole drive: `fps` for each second of it, and at least one."""
+    """Pictures uint8 [h, w, 3] of a whole drive: `fps` for each second of it, and at least one. Raises Stopped."""
     for k in range(max(1, round(drive.seconds * fps))):
+        stopping.check()
         yield picture(renderer, drive, k / fps, title)
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
-    Returns: how many there were. Raises: VideoError; a file that was there before is then kept.
+    Returns: how many there were. Raises: WriteError; a file that was there before is then kept.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -118,7 +116,7 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
         count = _encode(temporary, pictures, size, fps, CODING[path.suffix.lower()].split())
         os.replace(temporary, path)
     except OSError as error:
-        raise VideoError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -126,22 +124,18 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
 
 
 def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]) -> int:
-    """Pipe pictures through ffmpeg. Raises VideoError if there is no ffmpeg or it fails."""
-    import imageio_ffmpeg
+    """Pipe pictures through ffmpeg. Returns their number. Raises WriteError if there is no ffmpeg or it fails."""
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    try:
-        program = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise VideoError("there is no ffmpeg here; install one, or name it with IMAGEIO_FFMPEG_EXE") from error
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
     # Without `file:`, ffmpeg takes what stands before a colon in a name for a protocol.
-    command = [program, "-y", "-v", "error", *raw, "-an", *coding, f"file:{path}"]
+    arguments = ["-y", "-v", "error", *raw, "-an", *coding, f"file:{path}"]
     count = 0
     with tempfile.TemporaryFile() as messages:  # a pipe that nobody reads would fill up and stop ffmpeg
         try:  # in a session of its own, where Ctrl-C does not reach it
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages, start_new_session=True)
-        except OSError as error:
-            raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
+            process = Popen([get_ffmpeg_exe(), *arguments], stdin=PIPE, stderr=messages, start_new_session=True)
+        except (OSError, RuntimeError) as error:
+            raise WriteError(f"ffmpeg cannot be started: {error}") from error
         with process, contextlib.suppress(BrokenPipeError):  # its message follows
             assert process.stdin is not None
             with process.stdin as stream:
@@ -151,5 +145,5 @@ def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], f
         messages.seek(0)
         message = messages.read().decode(errors="replace").strip()
     if process.returncode:
-        raise VideoError(f"ffmpeg failed: {message.splitlines()[-1][:160] if message else process.returncode}")
+        raise WriteError(f"ffmpeg failed: {message.splitlines()[-1][:160] if message else process.returncode}")
     return count

@@ -38,6 +38,7 @@ def test_help_fills_its_lines_has_an_example_and_says_in_words_what_happens_by_d
 
 
 def test_what_is_not_given_follows_from_what_is():
+    assert not parse(EvaluateFlags, "gridsim-evaluate", ["runs/x", "--json", "--no-json"]).json
     learning = parse(EvolveFlags, "gridsim-evolve", ["--traffic", "2", "--generations", "5"]).learning
     assert (learning.policy, learning.population, learning.car_steps) == ("mlp:64+motion+steering", 128, 0)
 
@@ -70,10 +71,6 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, mo
 def test_a_whole_number_may_be_written_with_an_exponent_or_underscores(written, meant):
     assert parse(EvolveFlags, "gridsim-evolve", ["--car-steps", written]).learning.car_steps == meant
     assert parse(WatchFlags, "gridsim-watch", ["runs/x", f"--generation={written}"]).generation == meant
-
-
-def test_the_other_form_of_a_switch_is_known():
-    assert not parse(EvaluateFlags, "gridsim-evaluate", ["runs/x", "--json", "--no-json"]).json
 
 
 @pytest.mark.parametrize("prog", ["gridsim-evolve", "gridsim-drive"])  # more and less than a pipe's buffer holds
