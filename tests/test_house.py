@@ -21,7 +21,6 @@ BEHIND = {
     "mlflow": {
         "cluster/tracking/logged.py",
         "cluster/tracking/database.py",
-        "cluster/tracking/model.py",
         "cluster/tracking/sync.py",
     },
     "pygame": {"gridsim/view/render.py", "gridsim/view/drive.py"},

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from subprocess import Popen
 from typing import Annotated, ClassVar
 
 import tyro
@@ -34,6 +33,7 @@ from cluster.store.folder import RunFolder, lock, new_folder
 from cluster.tracking.address import check_uri
 from cluster.tracking.tracking import Status, Tracking, saved_uri
 from cluster.workers.address import cluster_address
+from cluster.workers.child import Child
 from gridsim.errors import GridSimError
 
 PROG = "gridsim-compare"
@@ -152,13 +152,13 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
 
 def _train(
     console: Console, left: Sequence[RunFolder], total: int, jobs: int, run_s: float,
-    start: Callable[[RunFolder], Popen[bytes]],
+    start: Callable[[RunFolder], Child],
 ) -> int:  # fmt: skip
     """Train the runs that are left of all, so many at once, until a signal comes; a run that fails stops no other.
 
     Args: `run_s` is how long a run may take, nan if that is unknown. Returns: how many failed.
     """
-    waiting, running, failed = deque(left), list[tuple[RunFolder, Popen[bytes]]](), 0
+    waiting, running, failed = deque(left), list[tuple[RunFolder, Child]](), 0
     began = time.perf_counter()
     ends_at = began + run_s * len(left) / jobs
     try:
@@ -172,12 +172,13 @@ def _train(
                 shown.facts = f"ETA {clock(ends_at - time.perf_counter())}"
                 shown.rest = "\n".join(f"{run.name}  {last_line(run)}" for run, _ in running)
                 time.sleep(LOOK_S)
-                for run, process in [each for each in running if each[1].poll() is not None]:
+                for run, process in [each for each in running if each[1].exit_code() is not None]:
                     running.remove((run, process))
+                    process.close(0.0)
                     _repeat(run)
                     now, to_do = time.perf_counter(), len(waiting) + len(running)
                     ends_at = now + to_do * (now - began) / (len(left) - to_do)
-                    if code := process.returncode:
+                    if code := process.exit_code():
                         failed += 1
                         see = f"its process ended with exit code {code}; see {short_path(log_of(run))}"
                         _say(f"{PROG}: {run.name} failed: {see}")
@@ -195,7 +196,7 @@ def _train(
         for _, process in running:
             process.terminate()
         for run, process in running:
-            process.wait()
+            process.close(None)
             _repeat(run)
     return failed
 

@@ -1,7 +1,6 @@
 """A comparison's runs as processes of the learners' commands.
 
-Each has a session of its own, so that Ctrl-C reaches the comparison alone, which passes it on. Linux sends them SIGTERM
-if the comparison is killed; elsewhere they go on.
+Ctrl-C reaches the comparison alone, which passes it on. They save and end, too, if the comparison is killed.
 """
 
 from __future__ import annotations
@@ -9,20 +8,14 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from cluster.store.folder import RunFolder
+from cluster.workers.child import Child
 
 LOGS = "logs"  # folder of what the runs print, in the comparison's
-# Becomes a command, and is sent SIGTERM (15) when its parent process ends: prctl(PR_SET_PDEATHSIG).
-WITH_PARENT = """\
-import ctypes, os, sys
-ctypes.CDLL(None).prctl(1, 15)
-if os.getppid() == int(sys.argv[1]):
-    os.execvp(sys.argv[2], sys.argv[2:])"""
 
 
 def flags_of(run: RunFolder, **more: object) -> list[str]:
@@ -31,22 +24,16 @@ def flags_of(run: RunFolder, **more: object) -> list[str]:
     return [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
 
 
-def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str, str]) -> Child:
     """Start the process that trains a run, whether it was begun or not; what it prints is in its log.
 
     Args: `flags` are the command's besides those of the run, and `environment` what its own has besides this one's.
     """
     folders = Path(sys.argv[0]).parent, Path(sys.executable).parent  # this program's, and Python's
     script = shutil.which(run.settings.command, path=os.pathsep.join(map(str, folders))) or run.settings.command
-    command = [script, "--resume-if-exists", *flags_of(run, **flags)]
-    if sys.platform == "linux":
-        command = [sys.executable, "-ISc", WITH_PARENT, str(os.getpid()), *command]
     log_of(run).parent.mkdir(exist_ok=True)
-    with log_of(run).open("wb") as log:
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
-            env={**os.environ, **environment},
-        )  # fmt: skip
+    command = [script, "--resume-if-exists", *flags_of(run, **flags)]
+    return Child(command, {**os.environ, **environment}, log_of(run))
 
 
 def log_of(run: RunFolder) -> Path:

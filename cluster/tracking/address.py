@@ -22,6 +22,7 @@ from gridsim.errors import GridSimError
 
 DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
+VIEW = "gridsim"  # the saved view of an experiment in MLflow's UI
 PROBE_S = 3.0
 _SERVERS = ("http", "https")
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
@@ -94,6 +95,12 @@ def _server_problem(uri: str) -> str:
         return "" if error.code in (400, 401, 403, 405, 429) else f"it answers with error {error.code}"
     except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
         return one_line(error)
+
+
+def run_table(server: str, experiment_id: str) -> str:
+    """Address of an experiment's run table in an MLflow server's UI, as MLflow 3.17 opens another page by default."""
+    page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
+    return f"{redacted(server)}/{page}"
 
 
 def address_scheme(uri: str) -> str:

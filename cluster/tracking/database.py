@@ -6,8 +6,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from cluster.tracking.address import TrackingError, is_database, schema_problem, sqlite_path, sqlite_uri
-from cluster.tracking.view import run_table
+from cluster.tracking.address import TrackingError, is_database, run_table, schema_problem, sqlite_path, sqlite_uri
 
 # MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {

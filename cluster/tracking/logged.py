@@ -13,18 +13,17 @@ import tempfile
 import time
 import uuid
 from collections import Counter, defaultdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cluster.redaction import one_line, redacted
 from cluster.store.checkpoint import MLFLOW, write_json
 from cluster.text import count
-from cluster.tracking.address import TrackingError, is_database, sqlite_path, unreachable
+from cluster.tracking.address import VIEW, TrackingError, is_database, sqlite_path, unreachable
 from cluster.tracking.commit import git_commit
 from cluster.tracking.content import CHAMPION_TAG, Content, Model
 from cluster.tracking.database import check_schema, create_database
-from cluster.tracking.model import write_model
-from cluster.tracking.view import VIEW_TAG, view
 
 if TYPE_CHECKING:
     from mlflow.entities import Run
@@ -33,6 +32,12 @@ Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 KEY_TAG = "gridsim.key"  # by which a run is found again
 NOTE_TAG = "mlflow.note.content"  # MLflow's for the description
+VIEW_TAG = f"mlflow.sharedViewState.{VIEW}"  # MLflow's of an experiment, for a saved view
+# What the view's run table shows of each run, and the columns' widths in pixels.
+COLUMNS = {
+    "attributes.`Run Name`": 270, "metrics.`held_out/success_rate`": 165, "metrics.`validation/success_rate`": 175,
+    "metrics.`held_out/speed_mps`": 150, "metrics.`car_steps`": 90,
+}  # fmt: skip
 MODEL = "model"  # folder of the champion among a run's artifacts
 BEST = "best"  # alias of a registered model's version with the greatest success on held-out roads
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
@@ -60,8 +65,8 @@ class LoggedRun:
         words = [count(rows, "row")] if rows else []
         if status is None:
             return words
-        if files := self._missing_files(content):
-            words.append(count(len(files), "file"))
+        if files := sum(path.name not in self._artifacts for path in content.files):
+            words.append(count(files, "file"))
         words += ["the model"] if content.model and not self._registered else []
         return words + ([f"the status {status}"] if status != self._status else [])
 
@@ -156,7 +161,7 @@ class LoggedRun:
             raise TrackingError(f"experiment {experiment_name!r} {problem} or choose another name")
         if VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
             with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
-                client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, view())
+                client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, _view())
         # mlflow.user, mlflow.source.*, and the parent of a comparison's run (MLFLOW_RUN_CONTEXT)
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]
         tags = {**natural, KEY_TAG: link["key"]}
@@ -186,13 +191,11 @@ class LoggedRun:
                 self._steps[metric.key].add(metric.step)
         self.sent["row"] += len({metric.step for metric in metrics})
 
-    def _missing_files(self, content: Content) -> list[Path]:
-        return [path for path in content.files if path.name not in self._artifacts]
-
     def _send_files(self, content: Content, status: Status | None) -> None:
-        for path in self._missing_files(content):
-            self._upload(path)
-            self.sent["file"] += 1
+        for path in content.files:
+            if path.name not in self._artifacts:
+                self._upload(path)
+                self.sent["file"] += 1
 
     def _upload(self, path: Path, folder: str | None = None) -> None:
         """Store a file; one by one, as MLflow's own pool of threads would hold up the exit if a server hangs.
@@ -226,7 +229,7 @@ class LoggedRun:
             return
         if f"{MODEL}/MLmodel" not in self._artifacts:
             with tempfile.TemporaryDirectory(prefix="gridsim-") as folder:
-                write_model(Path(folder, MODEL), model)
+                _write_model(Path(folder, MODEL), model)
                 for path in sorted(Path(folder, MODEL).iterdir(), key=lambda path: (path.name == "MLmodel", path)):
                     self._upload(path, MODEL)
         registry = os.environ.get("MLFLOW_REGISTRY_URI") or self._uri
@@ -273,6 +276,36 @@ class LoggedRun:
             self._client.set_tag(self.run_id, NOTE_TAG, f"{note}\n\n{result}")
         self._client.set_terminated(self.run_id, status, self._started_ms + round(1000.0 * content.wall_s))
         self._status = status or ""
+
+
+def _write_model(folder: Path, model: Model) -> None:
+    """Write a champion as files of MLflow's flavour `onnx` into a new folder."""
+    import numpy as np
+    import onnx
+    from mlflow.models import ModelSignature
+    from mlflow.onnx import save_model
+    from mlflow.types.schema import Schema, TensorSpec
+
+    float32 = np.dtype(np.float32)
+    observations = TensorSpec(float32, (-1, model.example.shape[1]), "observation")
+    save_model(
+        onnx.load(model.onnx),
+        str(folder),
+        signature=ModelSignature(Schema([observations]), Schema([TensorSpec(float32, (-1, 8), "outputs")])),
+        input_example=model.example,
+        metadata=dict(model.tags),
+        pip_requirements=[f"{name}=={version(name)}" for name in ("mlflow", "onnx", "onnxruntime")],
+        onnx_execution_providers=["CPUExecutionProvider"],
+        save_as_external_data=False,
+    )
+
+
+def _view() -> str:
+    """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
+    axis = {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0}
+    state = {"selectedColumns": list(COLUMNS), "columnOrder": list(COLUMNS), "columnWidths": COLUMNS}
+    state["globalLineChartConfig"] = axis
+    return json.dumps({"name": "GridSim", "createdAt": int(1000.0 * time.time()), "state": json.dumps(state)})
 
 
 def read_link(folder: Path) -> dict[str, Any]:

@@ -21,10 +21,9 @@ from typing import Any
 from cluster import stopping
 from cluster.redaction import redacted
 from cluster.text import count
-from cluster.tracking.address import UI, TrackingError, check_uri, is_database, is_locked, sqlite_path
+from cluster.tracking.address import UI, TrackingError, check_uri, is_database, is_locked, run_table, sqlite_path
 from cluster.tracking.content import Content
 from cluster.tracking.logged import Status, read_link
-from cluster.tracking.view import run_table
 
 CLOSE_S, STOP_S = 60.0, 15.0  # s that closing takes at most, for a finished run and for one that was stopped
 

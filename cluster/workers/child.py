@@ -37,10 +37,14 @@ class Child:
                     return False
         return self.exit_code() is None
 
-    def close(self, patience_s: float) -> None:
-        """End it; after `patience_s` kill it, with all that is left in its session. May be called again."""
+    def terminate(self) -> None:
+        """Send it SIGTERM."""
         assert self._process.stdin
         self._process.stdin.close()
+
+    def close(self, patience_s: float | None) -> None:
+        """End it; after `patience_s`, None is any time, kill what is left in its session. May be called again."""
+        self.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)
         with contextlib.suppress(ProcessLookupError):
