@@ -32,7 +32,7 @@ ELSEWHERE = {
     "make test": "tests/test_packaging.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
     ".venv/bin/gridsim-watch runs/<name>": "tests/cluster/test_watch.py::test_window_is_shown_on_a_chosen_driver",
-    ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_any_elite_is_watched_while_the_run_goes_on",
+    ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_any_elite_is_watched",
     ".venv/bin/gridsim-drive --scenario city --record drive.csv": "tests/gridsim/test_drive.py::test_real_keys_drive",
     ".venv/bin/gridsim-watch drive.csv": "tests/cluster/test_watch.py::test_watch_shows_a_recorded_drive",
     "ray start --head": "tests/conftest.py::head",
