@@ -81,7 +81,7 @@ def train(
         if place.workers or place.address:
             on_event(Event("starting the workers"))
         pool = open_pool(place.workers, place.address, place.patience_s, maps.build)
-        tracking.start()  # it has a thread, before which the pool sets variables
+        tracking.start()  # its thread must not read the environment while the pool sets Ray's variables
         session = Session(run, pool, maps, tracking, on_event, on_row, started, place.wall_limit_s, initial)
         session.learn()
         session.finish()

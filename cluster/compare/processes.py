@@ -19,7 +19,7 @@ LOGS = "logs"  # folder of what the runs print, in the comparison's
 
 
 def flags_of(run: RunFolder, **more: object) -> list[str]:
-    """Flags with which the learner's command makes a run, and more of them by name."""
+    """Flags with which the learner's command makes this run; `more` are further flags, by their fields' names."""
     flags = {**vars(run.settings), "output": run.path.parent, "name": run.name, **more}
     return [f"--{name.replace('_', '-')}={value}" for name, value in flags.items()]
 

@@ -37,7 +37,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         orders: a line of JSON with `folder`, `uri`, `experiment`, `argv`, and `read`, the function that reads the
             folder, as "module:name"; later perhaps one with a status.
         answers: gets what is known of MLflow's run, and what it lacks, before and after a request.
-        at_eof: is called, in a thread, if who orders has ended.
+        at_eof: is called in a thread when `orders` ends, as it does when the run's process has ended.
     """
     order, ends = json.loads(orders.readline()), SimpleQueue[Status]()
     sys.argv[:] = order["argv"]  # of which MLflow keeps the command
@@ -52,7 +52,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         print(json.dumps({**ids, "sent": run.sent, "error": error, "lacking": lacking}), file=answers)
 
     threading.Thread(target=listen, daemon=True).start()
-    import mlflow.tracking  # here, while the run starts
+    import mlflow.tracking  # takes seconds, in which the run goes on
 
     if is_database(order["uri"]):
         import mlflow.store.tracking.sqlalchemy_store  # noqa: F401
@@ -87,11 +87,11 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # a whole job may get them; we end after the run
         signal.signal(number, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # for whatever prints
+    os.dup2(2, 1)  # what MLflow prints must not come between the answers
     configure_mlflow()
     gc.set_threshold(200_000, 20, 20)  # with Python's own thresholds, MLflow's import takes a sixth longer
     serve(sys.stdin, answers, lambda: os._exit(1))
-    os._exit(0)  # the thread reads
+    os._exit(0)  # the thread that reads `stdin` would not end
 
 
 if __name__ == "__main__":

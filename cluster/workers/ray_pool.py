@@ -157,7 +157,7 @@ class RayPool(WorkerPool):
             answer = self._ray.get(reference)
         except errors.RayError as error:
             cause = error.cause if isinstance(error, errors.RayTaskError) else error
-            if isinstance(cause, errors.RayError):  # it is dead, or lacks what it needs
+            if isinstance(cause, errors.RayError):  # the worker is dead, or Ray lost an object that it needs
                 return self._replace(worker, reason(cause))
             if piece and piece.call is self._call:
                 raise PoolError(f"a worker failed on {piece.call.span(piece.chunk)}: {last_line(cause)}") from error
@@ -165,12 +165,12 @@ class RayPool(WorkerPool):
         worker.heard, self._deaths = time.monotonic(), 0
         if piece is None:
             worker.pid = answer
-        elif piece.call is self._call:  # else it is of an earlier one
+        elif piece.call is self._call:  # an answer to an earlier call is dropped
             piece.call.add(worker.pid, piece.chunk, *pickle.loads(answer))
 
     def _replace(self, worker: _Worker, why: str) -> None:
         """Replace a worker, and have what it held done by another one."""
-        at_it = worker.sent[0][1]  # it had not begun with what else it held
+        at_it = worker.sent[0][1]  # the piece that it was at; the others it had not begun
         self._pieces.extendleft(piece for _, piece in reversed(worker.sent) if piece and piece.call is self._call)
         self._ray.kill(worker.actor)  # it may be alive and merely out of reach
         self._workers[self._workers.index(worker)] = self._begin()

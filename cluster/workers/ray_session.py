@@ -30,21 +30,21 @@ ENVIRONMENT = {
     "PYTHONBREAKPOINT": "ray.util.rpdb._driver_set_trace",
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # prints nothing, deaths of workers included
 }
-CLUSTER_ENVIRONMENT = {  # besides, where an address is given, as what answers there may not be Ray
+CLUSTER_ENVIRONMENT = {  # added where an address is given: what answers there may not be Ray
     "RAY_py_gcs_connect_timeout_s": "3",  # for each of three requests
-    "RAY_gcs_server_port_wait_time_s": "1",  # which are made once
+    "RAY_gcs_server_port_wait_time_s": "1",
 }
-OWN_ENVIRONMENT = {  # besides, for a Ray of our own. Ray lets in whoever has its token.
+OWN_ENVIRONMENT = {  # added for a Ray of our own, which lets in whoever has its token
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # on loopback, as Ray is by itself on these
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
-HEAD_ENVIRONMENT = {  # for its processes alone
-    "RAY_prestart_worker_first_driver": "0",  # they would lack our environment
+HEAD_ENVIRONMENT = {  # for the processes of a Ray of our own, not for this one
+    "RAY_prestart_worker_first_driver": "0",  # workers that are started early lack our environment
     "RAY_worker_niceness": "0",  # Ray's 15 would let a busy machine starve the workers until patience ends the run
     "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1]),  # a relative name would mean another folder there
 }
-MEANINGS = {  # of Ray's errors, by what is in their texts
+MEANINGS = {  # what Ray's errors mean, by what their long texts contain
     "OutOfMemoryError": "memory is full where it ran; close other programs there, or give fewer --workers",
     "its node has died": "its host is gone",
     "a connection error": "its process was killed, crashed, or ran out of memory",
@@ -76,11 +76,11 @@ class Session:
         _has_token = _has_token or address is None
         wanted = ENVIRONMENT | (OWN_ENVIRONMENT if address is None else CLUSTER_ENVIRONMENT)
         new = wanted.keys() - os.environ.keys()
-        os.environ.update({name: wanted[name] for name in new})  # a thread that reads it just now would crash
+        os.environ.update({name: wanted[name] for name in new})  # before there are threads, which may be reading it
         try:
             return self._join(address or self._start(cpus, patience_s))
         finally:
-            for name in new:  # other programs would use our token
+            for name in new:  # else programs that this process starts would use our token
                 os.environ.pop(name, None)
 
     def _start(self, cpus: int, patience_s: float) -> str:
@@ -124,7 +124,7 @@ class Session:
             modules = [str(Path(__file__).parents[2] / package) for package in PACKAGES]
             sent = {"py_modules": modules, "excludes": ["__pycache__"], "working_dir": empty}
             quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
-            os.dup2(nowhere.fileno(), 2)  # what it prints while it waits for an answer
+            os.dup2(nowhere.fileno(), 2)  # Ray prints while it waits for an answer
             try:
                 error = thread.submit(ray.init, address, runtime_env=sent, **quiet).exception()
             finally:
