@@ -29,6 +29,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No deadline: an example that comes first may compile a kernel. CI's examples are the same in every run.
 settings.register_profile("gridsim", settings.get_profile("ci" if os.environ.get("CI") else "default"), deadline=None)
 settings.load_profile("gridsim")
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which commands inherit: under nohup no closed terminal would stop them
 
 
 @pytest.fixture(autouse=True)
