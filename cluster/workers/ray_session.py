@@ -103,13 +103,13 @@ class Session:
         import ray  # noqa: F401 - it takes a second, in which Ray's processes start
 
         while not (address := found.read_text() if found.exists() else ""):
+            stopping.check()  # first: a Ctrl-C may have ended the child before it had a session of its own
             if self._head.exit_code() is not None:
                 lines = log.read_text(errors="replace").splitlines()
                 said = [line for line in lines if "Error: " in line] or lines or ["its log is empty"]
                 raise PoolError(f"Ray cannot be started: {said[-1].strip()}; {cure}")
             if time.monotonic() > ends:
                 raise PoolError(f"Ray is not up after {patience_s:g} s (--patience), perhaps as this machine is busy")
-            stopping.check()
             time.sleep(LOOK_S)
         return address
 
