@@ -75,13 +75,14 @@ def train(
     try:
         lock(run.path)
         run.write_config()
+        tracking.start()
         if not kernels.is_compiled(settings):
             on_event(Event("compiling the simulator for runs of this kind, once (some 20 s)"))
             kernels.compile_ahead(settings)
         if place.workers or place.address:
             on_event(Event("starting the workers"))
         pool = open_pool(place.workers, place.address, place.patience_s, maps.build)
-        tracking.start()  # its thread must not read the environment while the pool sets Ray's variables
+        tracking.listen()  # no thread may read the environment while the pool sets Ray's variables
         session = Session(run, pool, maps, tracking, on_event, on_row, started, place.wall_limit_s, initial)
         session.learn()
         session.finish()

@@ -113,6 +113,7 @@ def _compare() -> int:
     failed = 0
     try:
         tracking.start()
+        tracking.listen()
         if left:
             with console.status("waiting for MLflow"):
                 parent = tracking.wait_id(WAIT_FOR_MLFLOW_S)

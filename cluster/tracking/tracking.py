@@ -32,7 +32,7 @@ Read = Callable[[Path], Content | None]
 
 
 class Tracking:
-    """A process that keeps MLflow up to date with a folder, from `start` to `close`.
+    """A process that keeps MLflow up to date with a folder, from `start` to `close`; `listen` is called in between.
 
     `run_id` is MLflow's id of the run, "" until it is known; `sent` counts the rows, files and models that were sent;
     `error` says why the last sync failed, in one line, and is None when MLflow has all.
@@ -52,11 +52,14 @@ class Tracking:
         self._process: Popen[str] | None = None
 
     def start(self) -> None:
-        """Start the process. A terminal's signals do not reach it."""
+        """Start the process, without a thread. A terminal's signals do not reach it."""
         command = [sys.executable, "-P", "-m", "cluster.tracking.sync"]
         self._process = Popen(command, text=True, start_new_session=True, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         self._tell(self._order)
         self._listener = threading.Thread(target=self._listen, args=(self._process,), daemon=True)
+
+    def listen(self) -> None:
+        """Start the thread that takes in what the process tells."""
         self._listener.start()
 
     def wait_id(self, timeout_s: float) -> str:
@@ -75,6 +78,8 @@ class Tracking:
         """
         if self._process is None:
             return None
+        if self._listener.ident is None:
+            self.listen()
         timeout_s = CLOSE_S if status == "FINISHED" else STOP_S
         nothing = False
         with contextlib.suppress(Exception):  # of a damaged folder, about which the process tells
@@ -131,7 +136,7 @@ def sync(folder: Path, uri: str, experiment: str, read: Read, status: Status = "
         tracking = Tracking(folder, check_uri(uri, saved_uri(folder)), experiment, read)
     except TrackingError as error:
         return "", f"could not upload to MLflow: {error}"
-    tracking.start()
+    tracking.start()  # `close` listens
     lacking = tracking.close(status)
     return ", ".join(count(number, noun) for noun, number in tracking.sent.items() if number), lacking
 

@@ -107,6 +107,7 @@ def tracking(folder, uri, experiment="driving", given=None):
     GIVEN[folder] = given
     started = Tracking(folder, uri, experiment, read_given if given else read_run)
     started.start()
+    started.listen()
     return started
 
 
