@@ -17,6 +17,9 @@ class Untracked:
     def start(self):
         pass
 
+    def listen(self):
+        pass
+
     def wait_id(self, timeout_s):
         return ""
 
