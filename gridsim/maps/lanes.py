@@ -117,10 +117,34 @@ def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tu
     return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)
 
 
-def _apart(one: np.ndarray, other: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """How far apart points [n, 2] and [m, 2] are along x and y on the torus: [n, m, 2]."""
-    away = other - one[:, None]
-    return np.abs(away - np.round(away / sides) * sides)
+@njit
+def _apart(one, other, side):
+    """How far apart two coordinates (m) are on the torus."""
+    away = other - one
+    return abs(away - round(away / side) * side)
+
+
+@njit
+def _pairs(starts, ends, boxes, group, width, height):
+    """Which lanes follow which, and which pairs may cross each other; both bool [lanes, lanes].
+
+    Args: start and end poses float64 [lanes, 3]; middle and half sides (m) of boxes, float64 [lanes, 4]; the group of
+    each lane.
+    """
+    n = len(starts)
+    follows, candidates = np.zeros((n, n), dtype=np.bool_), np.zeros((n, n), dtype=np.bool_)
+    for i in range(n):
+        for j in range(n):
+            turn = starts[j, 2] - ends[i, 2]
+            same_way = abs(turn - round(turn / (2 * math.pi)) * (2 * math.pi)) < _SAME
+            away = max(_apart(ends[i, 0], starts[j, 0], width), _apart(ends[i, 1], starts[j, 1], height))
+            follows[i, j] = same_way and away < _SAME
+            fork = max(_apart(starts[i, 0], starts[j, 0], width), _apart(starts[i, 1], starts[j, 1], height)) < _SAME
+            x, y, half_x, half_y = boxes[i]
+            gap_x = _apart(x, boxes[j, 0], width) - half_x - boxes[j, 2]
+            gap_y = _apart(y, boxes[j, 1], height) - half_y - boxes[j, 3]
+            candidates[i, j] = group[i] != group[j] and not fork and max(gap_x, gap_y) < CROSSING_GAP
+    return follows, candidates & ~(follows | follows.T)
 
 
 @njit
@@ -163,21 +187,16 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     offsets = np.concatenate([[0], np.cumsum(intervals + 1)]).astype(np.int32)
     points, ends = _sample(paths, steps, offsets)
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
-    turn = starts[:, 2] - ends[:, None, 2]
-    same_way = np.abs(turn - np.round(turn / (2 * math.pi)) * (2 * math.pi)) < _SAME
-    follows = same_way & (_apart(ends[:, :2], starts[:, :2], sides) < _SAME).all(axis=2)
+    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
+    boxes = np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1)
+    index = np.arange(n, dtype=np.int32)
+    follows, candidates = _pairs(starts, ends, boxes, index // abreast, *sides)
     if not follows.any(axis=1).all():
         raise ValueError("a lane must end where another begins")
     successors = np.full((n, FORKS), -1, dtype=np.int32)
     one, other = np.nonzero(follows)
     successors[one, np.arange(len(one)) - np.searchsorted(one, one)] = other
-    index = np.arange(n, dtype=np.int32)
-    neighbours = index[:, None] // abreast == index // abreast
-    forks = (_apart(starts[:, :2], starts[:, :2], sides) < _SAME).all(axis=2)
-    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
-    middle, half = (low + high) / 2, (high - low) / 2 + _ROUNDED
-    near = (_apart(middle, middle, sides) - half - half[:, None] < CROSSING_GAP).all(axis=2)
-    cross = _crossings(points, offsets, near & ~(neighbours | forks | follows | follows.T), *sides)
+    cross = _crossings(points, offsets, candidates, *sides)
     arrays = {
         "points": points,
         "speeds": np.zeros(len(points), dtype=np.float32),
@@ -190,7 +209,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
         "room": np.zeros(len(points), dtype=np.float32),
-        "boxes": np.concatenate([middle, half], axis=1).astype(np.float32),
+        "boxes": boxes.astype(np.float32),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
     return Network(**frozen, width=np.float32(width), height=np.float32(height))

@@ -9,9 +9,9 @@ import numpy as np
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, F, U, freeze, leaf, njit
-from gridsim.maps.roads import Road, clearances
+from gridsim.maps.roads import Road, clearance
 
-_ALONG_SIDE = np.linspace(-1.0, 1.0, 9)  # points of a car's side that are checked, as shares of its half length
+_ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
 
 class Network(NamedTuple):
@@ -88,29 +88,30 @@ def _ease(offsets, steps, successors, slope, room):
                     room[onward] = min(room[onward], room[last] + slope * steps[lane])
 
 
-def _room_on_right(lanes: Network, road: Road, config: SimConfig) -> np.ndarray:
+@njit
+def _room_on_right(points, offsets, road, length, width, verge, most, room):
     """How far (m) a car at each point can move to the right, limited by its right side; found by bisection."""
-    vehicle, traffic = config.vehicle, config.traffic
-    k, counts = np.arange(len(lanes.points)), np.diff(lanes.offsets)
-    before = np.maximum(k - 1, np.repeat(lanes.offsets[:-1], counts))
-    after = np.minimum(k + 1, np.repeat(lanes.offsets[1:] - 1, counts))
-    forward = lanes.points[after] - lanes.points[before]
-    forward /= np.hypot(*forward.T)[:, None]
-    right = np.stack([forward[:, 1], -forward[:, 0]], axis=1)
-    low: np.ndarray = np.zeros(len(k), dtype=np.float32)
-    high: np.ndarray = np.full(len(k), traffic.give_way, dtype=np.float32)
-    tried = high
-    for _ in range(7):
-        middle = lanes.points + tried[:, None] * right
-        gap = clearances(road, freeze(middle.astype(np.float32))) - vehicle.width / 2
-        side = middle + vehicle.width / 2 * right
-        for share in _ALONG_SIDE:
-            at = (side + share * vehicle.length / 2 * forward).astype(np.float32)
-            gap = np.minimum(gap, clearances(road, freeze(at)))
-        fits = gap >= traffic.verge
-        low, high = np.where(fits, tried, low), np.where(fits, high, tried)
-        tried = (low + high) / 2
-    return low
+    for lane in range(offsets.shape[0] - 1):
+        first, last = offsets[lane], offsets[lane + 1] - 1
+        for p in range(first, last + 1):
+            a, b = max(p - 1, first), min(p + 1, last)
+            fx, fy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+            norm = np.hypot(fx, fy)
+            fx, fy = fx / norm, fy / norm
+            low, high, tried = F(0.0), most, most
+            for _ in range(7):
+                x, y = points[p, 0] + tried * fy, points[p, 1] - tried * fx
+                gap = clearance(road, x, y) - HALF * width
+                x, y = x + HALF * width * fy, y - HALF * width * fx
+                for share in _ALONG_SIDE:
+                    along = share * length * HALF
+                    gap = min(gap, clearance(road, x + along * fx, y + along * fy))
+                if gap >= verge:
+                    low = tried
+                else:
+                    high = tried
+                tried = HALF * (low + high)
+            room[p] = low
 
 
 @njit
@@ -137,14 +138,16 @@ def make_network(lanes: Network, road: Road, config: SimConfig) -> Network:
     """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`."""
     traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
-    speeds, clear = np.empty(len(points), dtype=np.float32), np.empty(len(lanes.crossings), dtype=np.float32)
+    speeds, room = np.empty((2, len(points)), dtype=np.float32)
+    clear = np.empty(len(lanes.crossings), dtype=np.float32)
     top = F(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
     _speed_profile(points, offsets, steps, successors, top, F(traffic.lateral), F(traffic.comfort), speeds)
     crossing = lanes.crossing_offsets, lanes.crossings
     apart = F(config.vehicle.width + traffic.beside)
     _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
     beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
-    room = _room_on_right(lanes, road, config)
+    limits = config.vehicle.length, config.vehicle.width, traffic.verge, traffic.give_way
+    _room_on_right(points, offsets, road, *map(F, limits), room)
     room[np.repeat(beside, np.diff(offsets))] = 0.0
     _ease(offsets, steps, successors, F(traffic.taper), room)
     return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))

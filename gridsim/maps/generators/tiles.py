@@ -20,7 +20,7 @@ EDGE_SHARE = 0.9  # share of the graph's edges that are kept where SHORTEST_BLOC
 SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
 
 
-def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
+def _closes_short_block(edges: list[list[bool]], tile: int, direction: int) -> bool:
     """Whether opening this edge of a tile would close a block of fewer than SHORTEST_BLOCK tiles.
 
     The search is on the unrolled plane, since a way round the whole torus encloses no block.
@@ -33,7 +33,7 @@ def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
             (x + DIRECTIONS[d][0], y + DIRECTIONS[d][1])
             for x, y in frontier
             for d in range(4)
-            if edges[(y0 + y) % TILES * TILES + (x0 + x) % TILES, d]
+            if edges[(y0 + y) % TILES * TILES + (x0 + x) % TILES][d]
         } - seen
         seen |= frontier
         if goal in frontier:
@@ -52,13 +52,14 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
     No straight road closes round the torus: a car that does not steer leaves it.
     """
     while True:
-        edges = np.zeros((TILES * TILES, 4), dtype=bool)
+        opened = [[False] * 4 for _ in range(TILES * TILES)]
         pairs = [(tile, d) for tile in range(TILES * TILES) for d in (0, 1)]
         for k in rng.permutation(len(pairs))[: round(EDGE_SHARE * len(pairs))]:
             tile, d = pairs[k]
             other = _neighbour(tile, d)
-            if not _closes_short_block(edges, tile, d):
-                edges[tile, d] = edges[other, (d + 2) % 4] = True
+            if not _closes_short_block(opened, tile, d):
+                opened[tile][d] = opened[other][(d + 2) % 4] = True
+        edges = np.array(opened)
         while (ends := np.flatnonzero(edges.sum(axis=1) == 1)).size:
             for tile in ends:
                 for d in np.flatnonzero(edges[tile]):
