@@ -56,6 +56,10 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
 
     if is_database(order["uri"]):
         import mlflow.store.tracking.sqlalchemy_store  # noqa: F401
+    from mlflow.utils.requirements_utils import warn_dependency_requirement_mismatches
+
+    # MLflow lists all packages that are installed, as it will for the model: 0.3 s that would fall after the run.
+    warn_dependency_requirement_mismatches(["mlflow"])
     folder, read = Path(order["folder"]), pkgutil.resolve_name(order["read"])
     run = LoggedRun(folder, order["uri"], order["experiment"])
     status, error, last_syncs = None, None, 0
