@@ -1,4 +1,4 @@
-"""GridSim's Python API, without run folders or MLflow: train, also with your own fitness, load, drive, evaluate.
+"""GridSim's Python API: train, also with your own fitness or search, load, drive, evaluate.
 
 `import gridsim` offers all of it: `gridsim.evolve(scenario="city", workers=2)`.
 """
@@ -6,25 +6,42 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from cluster.learn.evolution import Evolution
-from cluster.learn.learning import finish
+from cluster.evaluator import Evaluator
+from cluster.fitness import Fitness, give
+from cluster.learn.learning import Event, finish
 from cluster.learn.maps import Maps
-from cluster.run import new_learning
+from cluster.run import Place, new_learning, train
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.store.champion import Champion, evaluate, load_champion
+from cluster.store.checkpoint import CHECKPOINT
+from cluster.store.folder import is_finished, new_run, open_run
+from cluster.store.steps import read_history
+from cluster.tracking.address import check_uri
+from cluster.tracking.tracking import saved_uri
+from cluster.workers.address import cluster_address
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 
-__all__ = ["Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn"]
+__all__ = [
+    "Champion",
+    "DqnSettings",
+    "Evaluator",
+    "EvolveSettings",
+    "compare",
+    "evaluate",
+    "evolve",
+    "load_champion",
+    "train_dqn",
+]
 
-Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
 OnStep = Callable[[int, dict[str, float]], None]
 Trained = tuple[Champion, list[dict[str, float]]]
 
@@ -34,9 +51,14 @@ def evolve(
     fitness: Fitness | None = None,
     workers: int = 0,
     on_generation: OnStep | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    address: str | None = None,
+    tracking_uri: str | None = None,
     **flags: Any,
 ) -> Trained:
-    """Evolve a driver in memory.
+    """Evolve a driver.
 
     >>> import gridsim
     >>> champion, history = gridsim.evolve(scenario="curved", population=32, generations=2)
@@ -50,23 +72,39 @@ def evolve(
             and targets (m). It runs in this process only. Default: `evolution.search.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process, on all its cores.
         on_generation: called with the number of generations done and the latest one's figures.
+        folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
+        resume: go on with the run in `folder` if there is one.
+        address: of a Ray cluster, host:port or "auto", for `workers` of which 0 is as many as it has CPUs free.
+        tracking_uri: MLflow's address, to which a run with a folder is sent; None sends nothing.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
     `.../mean` is over all members on training episodes, `.../best` of the best genome so far on its own episodes.
     Raises: GridSimError; the message is one line.
     """
-    return _train(settings or EvolveSettings(**flags), workers, on_generation, fitness)
+    settings = settings or EvolveSettings(**flags)
+    if fitness is not None:
+        settings = replace(settings, fitness=give(fitness))
+    return _train(settings, workers, on_generation, folder, resume, address, tracking_uri)
 
 
 def train_dqn(
-    settings: DqnSettings | None = None, workers: int = 0, on_evaluation: OnStep | None = None, **flags: Any
+    settings: DqnSettings | None = None,
+    workers: int = 0,
+    on_evaluation: OnStep | None = None,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    address: str | None = None,
+    tracking_uri: str | None = None,
+    **flags: Any,
 ) -> Trained:
-    """Train a driver by deep Q-learning, in memory, like `evolve`; the history has a row for each evaluation.
+    """Train a driver by deep Q-learning, like `evolve`; the history has a row for each evaluation.
 
     >>> import gridsim
     >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
     """
-    return _train(settings or DqnSettings(**flags), workers, on_evaluation)
+    settings = settings or DqnSettings(**flags)
+    return _train(settings, workers, on_evaluation, folder, resume, address, tracking_uri)
 
 
 def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
@@ -89,21 +127,27 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     ]
 
 
-def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
+def _train(
+    settings: RunSettings, workers: int, on_step: OnStep | None, folder: str | os.PathLike[str] | None, resume: bool,
+    address: str | None, tracking_uri: str | None,
+) -> Trained:  # fmt: skip
     settings.check()
     check_workers(workers, 0.0)
+    if folder is None and (resume or tracking_uri):
+        raise GridSimError("resume and tracking_uri are for a run that is kept: give a folder, too")
+    cluster = cluster_address(address) if address else None
+    on_row = on_step or (lambda steps, row: None)
+    if folder is not None:
+        return _train_in(Path(folder), settings, Place(workers, cluster), on_row, resume, tracking_uri)
     maps = Maps(settings.scenario, SimConfig())
     pool: WorkerPool | None = None
     try:
-        pool = open_pool(workers, None, 0.0, maps.build)
+        pool = open_pool(workers, cluster, 0.0, maps.build)
         learning = new_learning(settings, pool, maps)
-        if fitness is not None and isinstance(learning, Evolution):
-            learning.score = fitness
         while not learning.done():
             finish(learning.step())
             learning.elites.clear()  # needed only for a run's folder
-            if on_step:
-                on_step(learning.steps, learning.history[-1])
+            on_row(learning.steps, learning.history[-1])
         finish(learning.choose_champion())
         assert learning.champion is not None
         genome = learning.champion.genome
@@ -113,3 +157,26 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
         if pool:
             pool.close()
         maps.close()
+
+
+def _train_in(
+    folder: Path, settings: RunSettings, place: Place, on_row: OnStep, resume: bool, tracking_uri: str | None
+) -> Trained:
+    """Train a run in a folder, or go on with it; a finished one is read."""
+    if resume and (folder / CHECKPOINT).is_file():
+        run = open_run(folder)
+        settings = settings.extending(run.settings)
+        if replace(settings, **{name: getattr(run.settings, name) for name in settings.extendable}) != run.settings:
+            raise GridSimError(f"{folder} is a run with other settings; give those, or another folder")
+        run.settings = settings
+    else:
+        run = new_run(folder.absolute().parent, folder.name, settings, may_exist=resume)
+    if tracking_uri is not None:
+        place = replace(place, uri=check_uri(tracking_uri, saved_uri(run.path)))
+
+    def warn(event: Event) -> None:
+        if event.warning:
+            warnings.warn(event.text, stacklevel=2)
+
+    history = read_history(run.path) if is_finished(run) else train(run, place, warn, on_row).learning.history
+    return load_champion(run.path), history

@@ -48,7 +48,7 @@ class Place:
     workers: int = 0  # Ray workers; 0: in this process, or on a cluster as many as it has free CPUs
     address: str | None = None  # of a Ray cluster, host:port
     patience_s: float = 0.0  # without any worker, after which a run stops; 0: the usual
-    uri: str = ""  # MLflow's
+    uri: str = ""  # MLflow's; "": MLflow gets nothing
     experiment: str = ""
     wall_limit_s: float = math.inf  # wall-clock budget, including time before a resume; at least one step is done
 
@@ -75,7 +75,8 @@ def train(
     try:
         lock(run.path)
         run.write_config()
-        tracking.start()
+        if place.uri:
+            tracking.start()
         if not kernels.is_compiled(settings):
             on_event(Event("compiling the simulator for runs of this kind, once (some 20 s)"))
             kernels.compile_ahead(settings)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, g
 
 import tyro
 
+from cluster import fitness
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
@@ -160,6 +161,13 @@ class EvolveSettings(RunSettings):
     """With --recombination two: share of a child's genes that are mutated."""
     search: Literal["evolution", "random"] = "evolution"
     """evolution, or random: new random genomes in each generation, as a baseline."""
+    fitness: Annotated[str, IN_WORDS] = ""
+    """An objective of your own: MODULE:FUNCTION or FILE.py:FUNCTION (docs/own.md). Of the champions that succeed in
+    --until of the validation episodes, it decides which one is best, and the run goes on to its limit."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "fitness", fitness.absolute(self.fitness))
 
     def defaults(self) -> dict[str, Any]:
         alone = not self.traffic

@@ -16,7 +16,17 @@ ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in ("highway", "curv
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"
-_API = ("Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn")
+_API = (
+    "Champion",
+    "DqnSettings",
+    "Evaluator",
+    "EvolveSettings",
+    "compare",
+    "evaluate",
+    "evolve",
+    "load_champion",
+    "train_dqn",
+)
 
 for _id, _scenario in ENVIRONMENTS.items():
     _register(

@@ -4,7 +4,15 @@ import re
 from pathlib import Path
 
 import pytest
-from commands import running
+from commands import finish, running
+
+
+@pytest.mark.e2e
+def test_cma_es_learns_to_drive(root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cma")
+    done = finish("python", str(root / "examples/pycma.py"), "--minutes", "3", cwd=tmp_path)
+    assert float(re.findall(r"roads (\d+)%", done.stdout)[-1]) > 50.0
+    assert (tmp_path / "champion.npz").exists()
 
 
 @pytest.mark.e2e

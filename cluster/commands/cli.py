@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.console import Console
 
-from cluster import stopping
+from cluster import fitness, stopping
 from cluster.commands.common import (
     FAILED,
     RoadFlags,
@@ -36,7 +37,7 @@ from cluster.commands.progress import RunDisplay
 from cluster.commands.tables import errors_table, held_out_table
 from cluster.compare.results import series
 from cluster.run import Place, Session, train
-from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
+from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.stopping import INTERRUPTED
 from cluster.store.champion import evaluate, load_champion
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError, write_json
@@ -137,6 +138,9 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         if settings.command != prog:
             again = f"{settings.command} {'--resume' if resume else '--config'} {as_argument(Path(source))}"
             raise GridSimError(f"{source} belongs to another learner; use {again}")
+        if _fitness(settings) and not _fitness(flags.learning):
+            again = f"give --fitness {_fitness(settings)} again"
+            raise GridSimError(f"{source} has a fitness of its own, whose code runs only if you name it; {again}")
         base = kind(settings, WorkFlags(output=str(run.path.parent)) if run else WorkFlags(), start)
         flags = parse(kind, prog, arguments, base)
     settings = flags.learning
@@ -152,6 +156,8 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         check_unchanged(flags.work, base.work, MAY_DIFFER, (), "run")
         check_unchanged(flags.run, base.run, MAY_DIFFER, (), "run")
     settings.check()
+    if _fitness(settings):
+        fitness.load(_fitness(settings))  # raises GridSimError
     if isinstance(settings, DqnSettings) and settings.device == "cuda":
         from evolution.dqn.learner import device_of  # imports PyTorch
 
@@ -167,6 +173,11 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         digest = champion.sha256
     place = Path(flags.work.output), flags.run.name
     return flags, new_run(*place, settings, init, digest, may_exist=flags.run.resume_if_exists)
+
+
+def _fitness(settings: RunSettings) -> str:
+    """The fitness of one's own that settings name, or ""."""
+    return settings.fitness if isinstance(settings, EvolveSettings) else ""
 
 
 def _folder_to_resume(flags: Flags) -> str:
@@ -203,6 +214,8 @@ def _learn(prog: str) -> int:
         raise GridSimError(f"{folder}: another process has just begun this run; start the command again to continue it")
     stopping.listen()
     resume = f"{command_path(prog)} --resume {folder}"
+    if given := _fitness(settings):
+        resume += f" --fitness {shlex.quote(given)}"
     hint = f"continue with: {resume}"
     verb = "continuing" if run.saved else settings.verb
     console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}", soft_wrap=True)
@@ -259,8 +272,9 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     reached = [name for name in settings.extendable if 0 < getattr(settings, name) <= summary[name]]
     longer = " ".join(f"{as_flag(name)} {2 * summary[name]}" for name in reached)
     more = f"\nto go on: {resume} {longer}" if longer and not solved else ""
+    how = "solved" if solved else "ended" if _fitness(settings) else "not solved yet"
     console.print(
-        f"{'solved' if solved else 'not solved yet'} after {steps}, {summary['car_steps']:,} car-steps, "
+        f"{how} after {steps}, {summary['car_steps']:,} car-steps, "
         f"{summary['wall_s']:.0f} s{more}\n"
         f"success in validation{', on which the champion was chosen' if solved else ' at the end'}: "
         f"{summary['validation_success_rate']:.1%} "

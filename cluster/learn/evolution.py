@@ -6,12 +6,12 @@ it does well, as a candidate for champion, the validation episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from cluster import fitness as own
 from cluster.learn.learning import Learning, Progress, State, named
 from cluster.settings import EvolveSettings
 from cluster.workers.pool import Chunk
@@ -38,11 +38,11 @@ class Evolution(Learning):
     save_every_s: ClassVar[float] = 1.0
 
     settings: EvolveSettings
-    score: Callable[[np.ndarray, np.ndarray | float], np.ndarray] = fitness.scalar  # (RESULT [n, e], targets m) -> [n]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         s = self.settings
+        self._fitness = own.load(s.fitness) if s.fitness else fitness.scalar
         self.search: Search
         if s.search == "random" or s.recombination == "two":
             self.search = TwoParents(self.spec, s.search_config(), s.seed, random=s.search == "random")
@@ -52,11 +52,19 @@ class Evolution(Learning):
             self.search.start_from(self.initial)
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        """Scores float64 [n]; any that is not finite becomes the worst."""
-        score = np.asarray(self.score(results, target), dtype=np.float64)
-        if score.shape != (len(results),):
-            raise ValueError(f"a fitness must return one number per member, [{len(results)}], not {score.shape}")
+        """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes the worst."""
+        score = self._fitness(results, target)
         return np.where(np.isfinite(score), score, -np.inf)
+
+    def _standing(self, results: np.ndarray) -> tuple[float, float]:
+        score, second = super()._standing(results)
+        if self.settings.fitness:
+            return min(score, self.settings.until), float(self._score(results, self.curriculum.goal)[0])
+        return score, second
+
+    def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
+        super()._judge(candidate, results, step)
+        self.solved = self.solved and not self.settings.fitness  # which may still rise
 
     def step(self) -> Progress:
         """Evolve one generation."""

@@ -54,7 +54,7 @@ class Champion:
     genome: np.ndarray  # float32 [genes]
     score: float = 0.0  # `Curriculum.validation_score`
     success_rate: float = 0.0
-    distance_m: float = 0.0  # mean
+    second: float = 0.0  # decides between equal scores: mean distance (m), or the mean of a fitness of the user's own
     step: int = -1  # in which it was found
 
 
@@ -133,10 +133,14 @@ class Learning(ABC):
         """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
         self.tried = candidate
         self.validation_steps += int(results["steps"].sum())
-        score, distance = float(self.curriculum.validation_score(results)[0]), float(results["distance"].mean())
-        if self.champion is None or (score, distance) > (self.champion.score, self.champion.distance_m):
-            self.champion = Champion(candidate, score, float(success_rate(results)[0]), distance, step)
+        score, second = self._standing(results)
+        if self.champion is None or (score, second) > (self.champion.score, self.champion.second):
+            self.champion = Champion(candidate, score, float(success_rate(results)[0]), second, step)
         self.solved = self.champion.score >= self.settings.until
+
+    def _standing(self, results: np.ndarray) -> tuple[float, float]:
+        """What champions are compared by, from a candidate's validation, RESULT [1, episodes]; the first decides."""
+        return float(self.curriculum.validation_score(results)[0]), float(results["distance"].mean())
 
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
         """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""
@@ -189,7 +193,7 @@ class Learning(ABC):
             **{name: getattr(self, name) for name in self.checkpointed},
             **self.counts(),
             "columns": list(self.columns),  # of the history, which is also read without its learner
-            "champion": champion and [champion.score, champion.success_rate, champion.distance_m, champion.step],
+            "champion": champion and [champion.score, champion.success_rate, champion.second, champion.step],
         }
         return arrays, meta
 

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from cluster import fitness
 from cluster.redaction import one_line
-from cluster.settings import SETTINGS, RunSettings, from_dict
+from cluster.settings import SETTINGS, EvolveSettings, RunSettings, from_dict
 from cluster.store import checkpoint
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, ELITES, HISTORY, MLFLOW, STEPS, SUMMARY
 from cluster.text import as_argument, file_name
@@ -55,7 +56,6 @@ class RunFolder:
 
     def config(self) -> dict[str, Any]:
         """What config.json holds: enough to repeat the run."""
-        map_sha256 = _map_sha256(self.settings)
         return {
             "format": CONFIG_FORMAT,
             "command": self.settings.command,
@@ -65,7 +65,7 @@ class RunFolder:
             "simulator": dataclasses.asdict(SimConfig()),
             "init": self.init,
             "init_sha256": self.init_sha256,
-            **({"map_sha256": map_sha256} if map_sha256 else {}),
+            **_sources(self.settings),
         }
 
     def digest(self) -> str:
@@ -89,7 +89,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         if config["format"] != CONFIG_FORMAT:
             raise RunError(f"{path} is of an earlier GridSim, whose runs this one cannot continue; start a new run")
         settings = from_dict(SETTINGS[config["command"]], config["settings"])
-        if config.get("map_sha256", "") != _map_sha256(settings):
+        if config.get("map_sha256") != _sources(settings).get("map_sha256"):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
         return settings, str(config.get("init", ""))
     except RunError:
@@ -100,13 +100,16 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         raise RunError(f"{path}: not a run's {CONFIG} ({one_line(error):.120})") from error
 
 
-def _map_sha256(settings: RunSettings) -> str:
-    """Digest of the map's file, or "". Raises GridSimError."""
-    if not is_map_file(settings.scenario):
-        return ""
-    from gridsim.maps.files import map_digest  # imports SciPy, in 0.2 s
+def _sources(settings: RunSettings) -> dict[str, str]:
+    """Digests of the user's files that a run depends on: its map's and its fitness's. Raises GridSimError."""
+    found = {}
+    if is_map_file(settings.scenario):
+        from gridsim.maps.files import map_digest  # imports SciPy, in 0.2 s
 
-    return map_digest(settings.scenario)
+        found["map_sha256"] = map_digest(settings.scenario)
+    if isinstance(settings, EvolveSettings) and settings.fitness:
+        found["fitness_sha256"] = fitness.digest(settings.fitness)
+    return found
 
 
 @functools.cache  # so that a process may lock a folder again
@@ -139,6 +142,9 @@ def open_run(folder: Path) -> RunFolder:
     except checkpoint.CheckpointError as error:
         raise RunError(f"{error}; {anew}") from error
     meta = run.saved[1]
+    if _sources(run.settings).get("fitness_sha256") != json.loads((folder / CONFIG).read_bytes()).get("fitness_sha256"):
+        source = vars(run.settings)["fitness"]
+        raise RunError(f"{source} is not what it was as {folder} began; put it back, or start a new run")
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
         raise RunError(

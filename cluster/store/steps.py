@@ -6,6 +6,7 @@ when the run goes on. history.csv and elites.npz are written from them.
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -62,6 +63,13 @@ class Steps:
         for row in rows.tolist():
             self._history.append(",".join([str(len(self._history) - 1), *map(repr, row)]))
         checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode())
+
+
+def read_history(folder: Path) -> list[dict[str, float]]:
+    """The rows of history.csv. Raises: OSError."""
+    with open(folder / HISTORY, newline="") as file:
+        (_, *columns), *rows = csv.reader(file)
+    return [dict(zip(columns, map(float, row[1:]), strict=True)) for row in rows]
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:

@@ -60,12 +60,15 @@ class Tracking:
 
     def listen(self) -> None:
         """Start the thread that takes in what the process tells."""
-        self._listener.start()
+        if self._process:
+            self._listener.start()
 
     def wait_id(self, timeout_s: float) -> str:
         """MLflow's id of the run; "" if there is none by then, or as soon as a sync has failed."""
         end = time.monotonic() + timeout_s
-        while not self.run_id and time.monotonic() < end and (self.error is None or is_locked(self.error)):
+        while self._process and not self.run_id and time.monotonic() < end:
+            if self.error is not None and not is_locked(self.error):
+                break
             stopping.check()
             time.sleep(0.05)
         return self.run_id

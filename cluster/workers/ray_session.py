@@ -69,8 +69,10 @@ class Session:
         """Join a cluster, or start a Ray of our own with so many CPUs. Returns the module `ray`. Raises PoolError."""
         global _has_token
         ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
-        if getattr(ray, "is_initialized", bool)():
-            raise PoolError(f"Ray is in use in this process already: call ray.shutdown() first, {cure}")
+        if ray and getattr(ray, "is_initialized", bool)():
+            if address not in (None, "auto"):
+                raise PoolError(f"Ray is in use in this process already: leave the address out to use it, {cure}")
+            return ray  # a notebook's, or Ray Tune's; it is not ours to shut down
         if address is None and ray and not _has_token:
             raise PoolError(f"Ray was imported before it could be given a token: open the pool before that, {cure}")
         _has_token = _has_token or address is None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gridsim
-from cluster import api
+from cluster import api, evaluator
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.settings import DqnSettings
 from cluster.store.champion import held_out
@@ -115,21 +115,6 @@ def test_own_fitness_decides(champion):
     assert other.genome.tobytes() != champion.genome.tobytes()
 
 
-def test_fitness_of_the_wrong_shape_is_said_and_not_a_number_loses():
-    with pytest.raises(ValueError, match="one number per member"):
-        evolve(SMALL, fitness=lambda results, targets: results["steps"])
-
-    def some(results, targets):
-        score = results["distance"].mean(axis=1).astype(float)
-        if len(score) > 1:  # not of the leader alone
-            score[::2], score[1::4] = np.nan, np.inf
-        return score
-
-    champion, history = evolve(SMALL, fitness=some)
-    assert np.isfinite(champion.genome).all()
-    assert all(0.0 < row["fitness/best"] < np.inf for row in history)
-
-
 def test_bad_champions_are_refused(champion, tmp_path):
     save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "curved"})
     with pytest.raises(CheckpointError):
@@ -197,3 +182,4 @@ def test_gridsim_itself_has_the_python_api_and_its_examples_run():
         gridsim.evolv  # type: ignore[attr-defined]  # noqa: B018
     done = doctest.testmod(api)
     assert (done.attempted >= 5, done.failed) == (True, 0)
+    assert doctest.testmod(evaluator).failed == 0

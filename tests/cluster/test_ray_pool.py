@@ -120,9 +120,14 @@ def test_three_deaths_over_one_piece_end_the_run_in_one_line(pool: RayPool, fold
     assert goes_on(pool)
 
 
-def test_a_ray_that_is_in_use_is_left_alone(pool: RayPool) -> None:
-    with pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or .*\(workers=0\)$"):
-        open_pool(1, None, 0.0, never_built)
+def test_a_ray_that_is_in_use_is_used_and_left_alone(pool: RayPool) -> None:
+    with pytest.raises(PoolError, match=r"leave the address out to use it, or .*\(workers=0\)$"):
+        open_pool(1, "127.0.0.1:6379", 0.0, never_built)
+    with (
+        contextlib.closing(RayPool(1, never_built, patience_s=1.0, worker_factory=Answering)) as other,
+        pytest.raises(PoolError, match="Ray has 2 CPUs, 0 of them free"),
+    ):
+        other.open()
     assert goes_on(pool)
 
 

@@ -1,0 +1,133 @@
+"""Driving any genomes, for a search of one's own (`gridsim.Evaluator`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from cluster.learn.maps import Maps
+from cluster.settings import EvolveSettings, check_workers
+from cluster.store.champion import Champion
+from cluster.workers.address import cluster_address
+from cluster.workers.open import open_pool
+from cluster.workers.pool import Outcome
+from cluster.workers.worker import Task
+from evolution.episodes.starts import Episodes, lane_starts
+from evolution.networks.policy import PolicySpec
+from evolution.search import fitness
+from evolution.search.base import Generation, recipes
+from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
+from gridsim.maps.scenarios import TRAINING_SEED, seed_of_map
+
+MAPS = 128  # training maps from which episodes are drawn
+MAX_EPISODES = 10_000
+
+
+class Evaluator:
+    """Drives networks on training roads, on all cores or by Ray workers: what a search of your own asks for.
+
+    >>> import gridsim, numpy as np
+    >>> with gridsim.Evaluator("curved", policy="mlp:8", episodes=4) as evaluator:
+    ...     evaluator.fitness(np.zeros((2, evaluator.genes), dtype=np.float32)).shape
+    (2,)
+
+    Attributes: `genes`, the size of a genome; `spec`, its network.
+    """
+
+    def __init__(
+        self,
+        scenario: str = "seamless",
+        policy: str = "",
+        traffic: int = -1,
+        sim: SimConfig | None = None,
+        workers: int = 0,
+        address: str | None = None,
+        episodes: int = 16,
+    ):
+        """Open the pool of workers, which `close`, or the end of a `with`, ends.
+
+        Args:
+            scenario: a road's name, or a map file.
+            policy: the network, as for --policy of gridsim-evolve, whose default is this one's.
+            traffic: other cars; -1 is as many as the road usually has.
+            sim: vehicle, sensors, episodes and traffic. A lower target and time limit make an evaluation shorter.
+            workers, address: Ray workers, and a cluster's address; by default this process's threads.
+            episodes: that each genome drives.
+
+        Raises: GridSimError, a ValueError, in one line.
+        """
+        observation = "grid" if policy.startswith("cnn") else "rays"
+        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, observation=observation)
+        settings.check()
+        check_workers(workers, 0.0)
+        if not 1 <= episodes <= MAX_EPISODES:
+            raise GridSimError(f"episodes must be 1 to {MAX_EPISODES:,}, not {episodes}")
+        self._settings, self._sim, self._episodes = settings, sim or SimConfig(), episodes
+        self.spec = PolicySpec.parse(settings.policy)
+        self.genes: int = self.spec.size
+        self._maps = Maps(scenario, self._sim)
+        try:
+            self._pool = open_pool(workers, cluster_address(address or ""), 0.0, self._maps.build)
+        except BaseException:
+            self._maps.close()
+            raise
+
+    def __enter__(self) -> Evaluator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the workers. May be called again."""
+        self._pool.close()
+        self._maps.close()
+
+    def evaluate(self, genomes: np.ndarray, seed: int = 0) -> np.ndarray:
+        """Drive genomes [n, genes], all of them through the same episodes, which the seed decides.
+
+        Returns: the results, structured, [n, episodes], with the fields that `gridsim.evolve` gives to a fitness. They
+        are the same bits for any number of workers.
+        Raises: GridSimError for genomes that do not fit.
+        """
+        return self._drive(genomes, self._draw(seed))
+
+    def fitness(self, genomes: np.ndarray, seed: int = 0) -> np.ndarray:
+        """The scores float64 [n] of gridsim-evolve, in [0, 1], higher is better; otherwise as `evaluate`."""
+        episodes = self._draw(seed)
+        return fitness.scalar(self._drive(genomes, episodes), episodes.rows["target"].astype(np.float64))
+
+    def champion(self, genome: np.ndarray, sim: SimConfig | None = None) -> Champion:
+        """A genome [genes] as a champion, to be saved, watched, evaluated on held-out roads; `sim` is ours if None."""
+        s, genome = self._settings, self._checked(np.asarray(genome)[None])[0]
+        return Champion(genome, str(self.spec), s.scenario, sim or self._sim, s.traffic)
+
+    def _draw(self, seed: int) -> Episodes:
+        """New starts on training maps."""
+        if seed < 0:
+            raise GridSimError(f"a seed must be 0 or more, not {seed}")
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 21]))
+        used, local = np.unique(rng.integers(MAPS, size=self._episodes), return_inverse=True)
+        seeds = [TRAINING_SEED + m for m in used.tolist()]
+        self._maps.ahead(seeds)
+        maps = [self._maps.get(each) for each in seeds]
+        return Episodes(seeds, *lane_starts(maps, local, rng, self._settings.traffic, self._sim))
+
+    def _drive(self, genomes: np.ndarray, episodes: Episodes) -> np.ndarray:
+        members = Generation(np.zeros((0, self.genes), np.float32), recipes(0)).and_copies(self._checked(genomes))
+        scenario = self._settings.scenario
+        names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
+        shared: tuple[Any, ...] = (str(self.spec), episodes.rows, episodes.worlds, names, self._sim)
+        task = Task(*shared, members.parents, members.key, members.mutation)
+        return self._pool.run(Outcome(task, members.recipes)).results
+
+    def _checked(self, genomes: np.ndarray) -> np.ndarray:
+        genomes = np.ascontiguousarray(genomes, dtype=np.float32)
+        if genomes.ndim != 2 or genomes.shape[1] != self.genes:
+            raise GridSimError(f"genomes of {self.spec} must be [n, {self.genes}], not {list(genomes.shape)}")
+        finite = np.isfinite(genomes).all(axis=1)
+        if not finite.all():
+            raise GridSimError(f"genomes must be finite numbers; those of member {finite.argmin()} are not")
+        return genomes

@@ -1,0 +1,150 @@
+"""Fitness functions of the user's own: found by name, called, and their faults said in one line.
+
+A function is named `MODULE:FUNCTION` or `FILE.py:FUNCTION`, or is given in Python. Its code runs in the coordinator
+only, and only if the user names it in the command: a run's config.json holds its name and its source's digest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridsim.errors import GridSimError
+
+Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
+"""From results [n, episodes] and targets (m): scores [n], higher is better."""
+
+_given: dict[str, Fitness] = {}  # from Python, by name
+
+
+def give(function: Fitness) -> str:
+    """The name of a function that is given in Python, by which `load` finds it in this process."""
+    name = f"{getattr(function, '__module__', '?')}:{getattr(function, '__qualname__', type(function).__name__)}"
+    forget()
+    _given[name] = function
+    return name
+
+
+def forget() -> None:
+    """Have functions found anew, whose files may have changed."""
+    load.cache_clear()
+    _find.cache_clear()
+
+
+@cache
+def load(name: str) -> Fitness:
+    """The function of a name; it raises GridSimError where its own code fails. Raises: GridSimError."""
+    function = _given.get(name) or _find(name)
+
+    def score(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
+        try:
+            scores = np.asarray(function(results, targets), dtype=np.float64)
+        except Exception as error:
+            raise GridSimError(f"--fitness {name}: {_fault(error)}") from error
+        if scores.shape != (len(results),):
+            shape = f"returned an array of shape {list(scores.shape)}, not one number per member, [{len(results)}]"
+            raise GridSimError(f"--fitness {name}: {_place(function)} {shape}")
+        if np.isnan(scores).any():
+            raise GridSimError(
+                f"--fitness {name}: {_place(function)} returned nan for member {np.isnan(scores).argmax()}"
+            )
+        return scores
+
+    return score
+
+
+def digest(name: str) -> str:
+    """Digest of the source that a function comes from, of which nothing is run; "" if it cannot be found."""
+    try:
+        source = inspect.getsource(_given[name]).encode() if name in _given else _file(name).read_bytes()
+    except (OSError, TypeError, ValueError):
+        return ""
+    return hashlib.sha256(source).hexdigest()
+
+
+def _file(name: str) -> Path:
+    """The file of a function's module. Raises: ValueError, OSError."""
+    source = name.rpartition(":")[0]
+    if source.endswith(".py"):
+        return Path(source)
+    first, *others = source.split(".")
+    with _working_folder():
+        found = importlib.util.find_spec(first)  # of `a.b` it would run `a`
+    if not found or not found.origin:
+        raise ValueError
+    path = Path(found.origin).parent.joinpath(*others) if others else Path(found.origin)
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def absolute(name: str) -> str:
+    """A name that means the same in every folder."""
+    file, mark, function = name.rpartition(":")
+    return f"{os.path.abspath(file)}{mark}{function}" if file.endswith(".py") else name
+
+
+@cache
+def _find(name: str) -> Fitness:
+    source, _, attribute = name.rpartition(":")
+    if not source or not attribute:
+        raise GridSimError(f"--fitness {name}: give MODULE:FUNCTION or FILE.py:FUNCTION")
+    try:
+        with _working_folder():
+            function: Any = _module_of_file(source) if source.endswith(".py") else importlib.import_module(source)
+        for part in attribute.split("."):
+            function = getattr(function, part)
+    except AttributeError:
+        raise GridSimError(f"--fitness {name}: there is no {attribute} in {source}") from None
+    except Exception as error:
+        raise GridSimError(f"--fitness {name} cannot be imported: {_fault(error)}") from error
+    if not callable(function):
+        raise GridSimError(f"--fitness {name}: {attribute} is not a function")
+    return function  # type: ignore[no-any-return]
+
+
+def _module_of_file(path: str) -> Any:
+    name = f"fitness_{hashlib.sha256(path.encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec
+    assert spec.loader
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@contextlib.contextmanager
+def _working_folder() -> Iterator[None]:
+    """Modules may lie in the working folder."""
+    sys.path.append(os.getcwd())
+    try:
+        yield
+    finally:
+        sys.path.remove(os.getcwd())
+
+
+def _place(function: Any) -> str:
+    """File and line where a function begins."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else str(function)
+
+
+def _fault(error: Exception) -> str:
+    """File and line of an error, and its last line."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{Path(error.filename).name}:{error.lineno}: SyntaxError: {error.msg}"
+    others = (__file__, importlib.__file__)
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename not in others]
+    own = [frame for frame in own if not frame.filename.startswith("<frozen")]
+    said = traceback.format_exception_only(error)[-1].strip()
+    return f"{Path(own[-1].filename).name}:{own[-1].lineno}: {said}" if own else said

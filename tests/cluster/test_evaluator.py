@@ -1,0 +1,68 @@
+"""`gridsim.Evaluator`: what a search of the user's own asks for."""
+
+import numpy as np
+import pytest
+
+import gridsim
+from evolution.search import fitness
+from gridsim.config import EpisodeConfig, SimConfig
+from gridsim.errors import GridSimError
+
+SHORT = SimConfig(episode=EpisodeConfig(target=100.0, time_limit=30.0))
+
+
+def test_episodes_follow_from_the_seed_and_results_from_genome_and_episode_alone() -> None:
+    with gridsim.Evaluator("curved", policy="mlp:8", traffic=2, sim=SHORT, episodes=6) as evaluator:
+        genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
+        results = evaluator.evaluate(genomes, seed=3)
+        assert results.shape == (40, 6)
+        assert results.tobytes() == evaluator.evaluate(genomes[::-1], seed=3)[::-1].tobytes()
+        assert results.tobytes() != evaluator.evaluate(genomes, seed=4).tobytes()
+        scores = evaluator.fitness(genomes, seed=3)
+        assert np.array_equal(scores, fitness.scalar(results, 100.0))
+        assert 0.0 < scores.max() <= 1.0
+        driver = evaluator.champion(genomes[0])
+    assert (driver.policy, driver.scenario, driver.traffic, driver.sim) == ("mlp:8", "curved", 2, SHORT)
+    assert gridsim.evaluate(driver, episodes=4)["episodes"] == 4
+
+
+@pytest.mark.e2e
+def test_it_uses_a_ray_that_is_in_use_for_the_same_bits() -> None:
+    import ray
+
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        found = []
+        for workers in (0, 2):
+            with gridsim.Evaluator("curved", policy="mlp:8", sim=SHORT, workers=workers) as evaluator:
+                genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
+                found.append(evaluator.evaluate(genomes).tobytes())
+        assert found[0] == found[1]
+        assert ray.is_initialized(), "it was not ours to shut down"
+    finally:
+        ray.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"scenario": "moon"}, "unknown scenario 'moon'"),
+        ({"policy": "mlp"}, "mlp"),
+        ({"workers": -1}, "--workers must be"),
+        ({"episodes": 0}, "episodes must be 1 to 10,000, not 0"),
+    ],
+)
+def test_wrong_use_is_said_in_one_line(given: dict, said: str) -> None:
+    with pytest.raises(GridSimError, match=said):
+        gridsim.Evaluator(**given)
+
+
+def test_genomes_that_do_not_fit_are_refused() -> None:
+    with gridsim.Evaluator("curved", policy="mlp:8") as evaluator:
+        for wrong in (np.zeros((2, 5)), np.zeros(evaluator.genes)):
+            with pytest.raises(GridSimError, match=r"^genomes of mlp:8 must be \[n, 336\], not \["):
+                evaluator.evaluate(wrong)
+        wrong = np.zeros((3, evaluator.genes))
+        wrong[2, 7] = np.nan
+        with pytest.raises(GridSimError, match=r"must be finite numbers; those of member 2 are not$"):
+            evaluator.fitness(wrong)
