@@ -144,7 +144,6 @@ class Host:
         self.address = address
 
     def serve_ssh(self, authorized: str) -> None:
-        """Let in who has the key."""
         (self.home / ".ssh" / "authorized_keys").write_text(authorized)
         self.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/host")
         options = (
@@ -155,7 +154,6 @@ class Host:
         self.run(shutil.which("sshd", path=SEARCH), "-f", "/dev/null", "-E", "/tmp/sshd.log", *flags)
 
     def processes(self) -> list[str]:
-        """Command lines of what runs there."""
         return [command_line(pid) for pid in descendants(self.pid)]
 
     def listening(self) -> dict[int, set[str]]:

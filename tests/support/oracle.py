@@ -185,10 +185,8 @@ def _in_capsule(p: np.ndarray, d: np.ndarray, lines: np.ndarray) -> tuple:
     u = np.where(length[:, None] > 0, b - a, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
     v = np.stack([-u[:, 1], u[:, 0]], axis=1)
     q = p - a
-    box = _meet(
-        _between(np.vecdot(q, u), np.vecdot(d, u), 0.0, length),
-        _between(np.vecdot(q, v), np.vecdot(d, v), -w, w),
-    )
+    along = _between(np.vecdot(q, u), np.vecdot(d, u), 0.0, length)
+    box = _meet(along, _between(np.vecdot(q, v), np.vecdot(d, v), -w, w))
     parts = (box, _in_disc(q, d, w), _in_disc(p - b, d, w))
     return np.minimum.reduce([i[0] for i in parts]), np.maximum.reduce([i[1] for i in parts])
 
@@ -200,10 +198,7 @@ def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[t
     e0 = np.stack([np.cos(first), np.sin(first)], axis=1)
     e1 = np.stack([np.cos(last), np.sin(last)], axis=1)
     n0, n1 = np.stack([-e0[:, 1], e0[:, 0]], axis=1), np.stack([e1[:, 1], -e1[:, 0]], axis=1)
-    sector = _meet(
-        _between(np.vecdot(q, n0), np.vecdot(d, n0), 0.0, np.inf),
-        _between(np.vecdot(q, n1), np.vecdot(d, n1), 0.0, np.inf),
-    )
+    sector = _meet(*(_between(np.vecdot(q, n), np.vecdot(d, n), 0.0, np.inf) for n in (n0, n1)))
     outer = _meet(sector, _in_disc(q, d, radius + w))
     hole = _in_disc(q, d, radius - w)
     before = _meet(outer, (np.full_like(hole[0], -np.inf), hole[0]))
