@@ -25,7 +25,7 @@ from evolution.search.breeding import RECIPE, Kind, Mutation, _breed
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
-from gridsim.state import TRAFFIC_FIELDS as FIELDS
+from gridsim.state import TRAFFIC_FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
 
@@ -53,13 +53,13 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
     if episodes is None:
         episodes = goals(*[150.0] * (len(maps) or 2))
-    worlds = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32)
+    worlds = np.zeros((len(episodes), 0, TRAFFIC_FIELDS), dtype=np.float32)
     return Task("mlp:6,7", episodes, worlds, maps, SimConfig(), parents, 12345, Mutation())
 
 
 def make_collect_task(n: int) -> CollectTask:
     """Episodes that `Answering` marks by their numbers."""
-    weights, epsilons, worlds = (np.zeros(shape, dtype=np.float32) for shape in (311, n, (n, 0, FIELDS)))
+    weights, epsilons, worlds = (np.zeros(shape, dtype=np.float32) for shape in (311, n, (n, 0, TRAFFIC_FIELDS)))
     keys = np.arange(n, dtype=np.uint64)
     return CollectTask("mlp:6,7", goals(*[150.0] * n), worlds, (), SimConfig(), weights, epsilons, keys)
 

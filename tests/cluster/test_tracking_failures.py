@@ -153,6 +153,8 @@ def test_addresses_become_absolute(here, monkeypatch, empty_database):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///a folder/from the environment.db")
     assert check_uri() == f"sqlite:///{here}/a folder/from the environment.db"
     assert check_uri("sqlite:///given.db") == f"sqlite:///{here}/given.db"
+    unix = "postgresql://u:p@/db?host=/var/run/postgresql"  # a socket, not looked for on a port
+    assert check_uri(unix) == unix
     assert os.listdir(here) == ["a folder"]
 
 

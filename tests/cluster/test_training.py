@@ -22,8 +22,7 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 from gridsim.config import SimConfig
-from gridsim.state import LANE, End
-from gridsim.state import TRAFFIC_FIELDS as FIELDS
+from gridsim.state import LANE, TRAFFIC_FIELDS, End
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
@@ -152,7 +151,7 @@ def test_training_is_among_more_cars_than_validation(maps):
     """Twice as many as were asked for; champions are chosen, and measured, among those that were."""
     curriculum = begin(maps).curriculum
     for episodes in (curriculum.episodes(0), curriculum.leader_episodes(0)):
-        assert episodes.worlds.shape[1:] == (2 * SETTINGS.traffic, FIELDS)
+        assert episodes.worlds.shape[1:] == (2 * SETTINGS.traffic, TRAFFIC_FIELDS)
         assert (episodes.worlds[..., LANE] >= 0).mean() > 0.95
     there = curriculum.validation().worlds[..., LANE] >= 0
     assert there.shape[1] == 2 * SETTINGS.traffic  # it is driven beside training's

@@ -77,10 +77,7 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):
-    """The car and its world are those of so many steps before the end, or of the start; no result depends on it.
-
-    With the same actions they end the same.
-    """
+    """Car and world of so many steps before the end, or of the start, which change no result, end alike once more."""
     spec, genome, maps, episodes, worlds, paths = among
     both = np.stack([genome, np.zeros_like(genome)])
     plain, starts, then = evaluate(spec, both, maps, episodes, CONFIG, worlds)

@@ -97,7 +97,6 @@ DAMAGES = {
 
 
 def _edit(text, row, column, value):
-    """One field of a data row, changed."""
     rows = [line.split(",") for line in text.splitlines()]
     rows[row + 1][COLUMNS.index(column)] = value
     return "".join(",".join(fields) + "\n" for fields in rows)

@@ -21,6 +21,7 @@ from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.maps.map import Map, starts_at
+from gridsim.maps.scenarios import REGISTRY
 from gridsim.sensing.grid import grid_table, grids
 from gridsim.simulator import Simulator, views
 from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End
@@ -92,6 +93,7 @@ def test_an_episode_follows_from_seed_and_number_alone(maps: Maps, name: str, op
     first = run(env, 50, actions, copy.deepcopy)
     assert sum((row[3] | row[4]).sum() for row in first[1:]) >= 2 * n  # all are in their third episode
     assert (first[0][1][:, :, LANE] >= 0).all()
+    assert env.simulator.worlds.shape[1] == options.get("traffic", REGISTRY[name].traffic)
     assert not np.array_equal(first[0][1][0], first[0][1][1])
     np.testing.assert_equal(run(env, 50, actions, list), first)
 

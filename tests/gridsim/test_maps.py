@@ -209,7 +209,6 @@ def test_transparent_is_wall(tmp_path, mode):
 
 
 def test_tiles_do_not_show():
-    """A picture cut up gives what it gives whole."""
     free = np.random.default_rng(3).random((40, 1300)) < 0.97  # 0.25 m: 325 m, three tiles
     free = free.repeat(4, axis=0)
     nodes = signed_clearance(free, 0.25, 1024, 128)
@@ -286,7 +285,6 @@ def test_runs_know_their_map_again(here, monkeypatch):
 
 
 def refused(name):
-    """The one line with which a file is refused."""
     with pytest.raises(GridSimError, match=r"^[^\n]{1,600}$") as caught:
         load_map(str(name))
     with pytest.raises(GridSimError):
@@ -402,7 +400,6 @@ def test_any_values(small, changes, drop):
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 32), st.sampled_from([1, 4, 10]))
 def test_any_pixels(small, seed, share, grain, ppm):
-    """Blobs of any size."""
     coarse = (np.random.default_rng(seed).random((64 // grain + 1,) * 2) < share).astype(np.uint8) * 255
     save(small[0] / "blobs.png", coarse.repeat(grain, axis=0).repeat(grain, axis=1)[:64, :64])
     path = small[0] / "blobs.yaml"

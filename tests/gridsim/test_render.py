@@ -34,7 +34,6 @@ def car_at(x, y, heading=0.0):
 
 
 def distance(pixels, colour):
-    """How far pixels [..., 3] are from a colour."""
     return np.abs(pixels.astype(int) - np.array(colour)).max(axis=-1)
 
 

@@ -161,7 +161,6 @@ OTHERS = [SensorConfig(rays=61), SensorConfig(rays=7, field_of_view=60.0, range=
 @example(sensors=CONFIG.sensors, shares=np.where(np.arange(61) % 2, 0.2, 1.0).astype(F))
 @given(sensors=st.sampled_from([CONFIG.sensors, *OTHERS]), shares=arrays.arrays(F, 61, elements=SHARES))
 def test_every_cell_is_what_geometry_says(sensors, shares):
-    """Of ranges that are shares of the sensor's."""
     config, ranges = SimConfig(sensors=sensors), shares[: sensors.rays] * F(sensors.range)
     expected, unsure = cell_by_cell(config, ranges)
     assert (grids(grid_table(config), ranges[None])[0] == expected)[~unsure].all()
@@ -236,10 +235,7 @@ def test_rays_are_the_oracles():
 
 
 def outlines_meet(one, other):
-    """Whether rectangles [n, 4, 2] share ground with others [n, 4, 2]: bool [n].
-
-    They do unless, seen along an edge of one of them, all corners of one lie before all those of the other.
-    """
+    """Whether rectangles [n, 4, 2] share ground with others, as none lies before the other along an edge: bool [n]."""
     apart = np.zeros(len(one), dtype=bool)
     for of in (one, other):
         for edge in (of[:, 1] - of[:, 0], of[:, 2] - of[:, 1]):
@@ -311,10 +307,7 @@ def meet(scenario, start, lane, along):
 
 @pytest.mark.parametrize("aside", [0.0, -1.9, 2.1])
 def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
-    """30 against 30 m/s, 6 m a control period, at every phase of it; and past each other with 10 cm to spare.
-
-    The other car comes from beyond the seam, where it is still when they meet.
-    """
+    """6 m a control period, at every phase of it, over the seam; and past each other with 10 cm to spare."""
     for phase in np.arange(0.0, 6.0, 0.4):
         simulator, end = meet(cross, [229.0, 128.0 + aside, 0.0, 30.0, 0.0], 0, SIDE - 23.0 - phase)
         assert end == (End.COLLISION if abs(aside) < 2.0 else End.RUNNING)

@@ -15,12 +15,8 @@ needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
 
 
 class Browser:
-    """A browser with one open page, driven by the DevTools protocol over a pipe.
-
-    Attributes:
-        faults: what went wrong on the page: exceptions, console errors, what its policy blocked.
-        requests: addresses that the page asked for.
-    """
+    """A browser with one open page, driven by the DevTools protocol over a pipe. `faults` are its exceptions, console
+    errors and what its policy blocked, `requests` the addresses that it asked for."""
 
     def __init__(self, address, profile):
         to_browser, self._out = os.pipe()

@@ -84,13 +84,8 @@ class Command:
 
 
 class Host:
-    """One machine. `folder` holds what its disk is from the outside: tmp, home.
-
-    Args:
-        folder: a new one.
-        keep: paths that are the same on each host (the checkout, Python).
-        hide: folders that are empty on this one.
-    """
+    """One machine. `folder`, a new one, holds what its disk is from the outside: tmp, home. Paths to `keep` are the
+    same on each host (the checkout, Python); folders to `hide` are empty on this one."""
 
     def __init__(self, folder: Path, keep: list[Path], hide: Collection[str] = ()):
         self.folder, self.home = folder, folder / "home"
