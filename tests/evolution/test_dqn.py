@@ -111,6 +111,8 @@ def stacked(spec, row, starts):
 def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, spec):
     replay = Replay(spec, capacity, 0.9)
     parts, first = [], 0
+    with pytest.raises(ValueError, match="no transition yet"):
+        replay.sample(0, 4)
     for added in adds:
         new = []
         for rewards, end in added:
@@ -122,8 +124,6 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, spec):
         assert len(replay) == min(first, capacity)
         assert replay.transitions == len(known)
         if not known:
-            with pytest.raises(ValueError, match="no transition yet"):
-                replay.sample(0, 4)
             continue
         batch = replay.sample(first, 64)
         where = numbers(batch.observations, spec)

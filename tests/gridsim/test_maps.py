@@ -339,6 +339,7 @@ WRONG = {
     "{image: map.png, resolution: 0.1, start: []}": "unknown key 'start'",
     "{image: map.png, resolution: 0.1, free_thresh: 0.7}": "not above occupied_thresh",
     "{image: map.png, resolution: 0.1, negate: 2}": "negate",
+    "{image: map.png, resolution: 0.1, mode: raw}": "mode must be trinary or scale",
     "{image: map.png, resolution: 0.1, origin: [0, 0, 0.5]}": "yaw",
     "{image: map.png, resolution: 0.1, speed: [9, 3]}": "speed",
     "{image: map.png, resolution: 0.1, starts: {x: 1}}": "starts",
