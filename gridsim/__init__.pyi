@@ -2,6 +2,7 @@
 
 from cluster.api import Champion as Champion
 from cluster.api import DqnSettings as DqnSettings
+from cluster.api import Evaluator as Evaluator
 from cluster.api import EvolveSettings as EvolveSettings
 from cluster.api import compare as compare
 from cluster.api import evaluate as evaluate

@@ -47,6 +47,13 @@ def root() -> Path:
     return Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, which is the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
@@ -100,7 +107,6 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Short pauses of tracking."""
     from cluster.tracking import address, sync
 
     monkeypatch.setattr(sync, "SYNC_S", 0.05)
@@ -115,6 +121,16 @@ def maps() -> dict[str, list]:
     from gridsim.maps.scenarios import REGISTRY, build
 
     return {name: [build(name, seed) for seed in range(2)] for name in REGISTRY}
+
+
+@pytest.fixture(scope="module")
+def curved() -> Iterator:
+    """What builds maps of the scenario of that name, which are built fastest."""
+    from cluster.learn.maps import Maps
+    from gridsim.config import SimConfig
+
+    with contextlib.closing(Maps("curved", SimConfig())) as kept:
+        yield kept
 
 
 @pytest.fixture

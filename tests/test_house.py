@@ -1,7 +1,8 @@
-"""The house rules: who may import whom, what sits behind one file, how large a file and a folder may be."""
+"""The house rules: who may import whom, what sits behind one file, how large files are; and what is installed."""
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections import Counter
@@ -9,63 +10,46 @@ from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from importlib.metadata import packages_distributions
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import finish
 
+PROJECT: dict[str, Any] = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
 # Imports run downwards only: cluster -> evolution -> gridsim.
 RANK = {"gridsim": 0, "evolution": 1, "cluster": 2}
 # The only files that may import these, anywhere in them.
 BEHIND = {
     "ray": {"cluster/workers/ray_pool.py", "cluster/workers/ray_session.py"},
-    "mlflow": {
-        "cluster/tracking/logged.py",
-        "cluster/tracking/database.py",
-        "cluster/tracking/sync.py",
-    },
+    "mlflow": {"cluster/tracking/logged.py", "cluster/tracking/database.py", "cluster/tracking/sync.py"},
     "pygame": {"gridsim/view/render.py", "gridsim/view/drive.py"},
 }
 # What a package knows nothing of.
 NOT_IN = {"gridsim": {"ray", "mlflow", "torch", "tyro", "rich"}, "evolution": {"ray", "mlflow", "tyro", "rich"}}
-# Elsewhere torch is imported inside functions only: it costs seconds, and 200 MB in each worker.
-TORCH_AT_IMPORT = {"evolution/dqn/learner.py"}
-
 MOST_MODULES, MOST_LINES = 14, 500  # of a folder, and of a file
 
 
-def imports(node: ast.AST, when: str = "at import") -> Iterator[tuple[str, int, str]]:
-    """Yield each module, and each of its names, that is imported, the line, and when: also later, or only for types."""
-    if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-        when = "for types"
-    elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and when == "at import":
-        when = "later"
-    elif isinstance(node, ast.Import):
-        for alias in node.names:
-            yield alias.name, node.lineno, when
-    elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-        for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
-            yield name, node.lineno, when
-    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-        for argument in node.args[:1]:
-            if isinstance(argument, ast.Constant):
-                yield str(argument.value), node.lineno, when
-    for inner in ast.iter_child_nodes(node):
-        yield from imports(inner, when)
+def imports(source: str) -> Iterator[tuple[str, int]]:
+    """Yield each module, and each of its names, that is imported anywhere in a file, and the line."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield from ((name, node.lineno) for name in (node.module, *(f"{node.module}.{a.name}" for a in node.names)))
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+            yield from ((str(name.value), node.lineno) for name in node.args[:1] if isinstance(name, ast.Constant))
 
 
 def breaches(file: str, source: str) -> Iterator[str]:
     """Yield what in a file (its path from the root) breaks a rule, a line each."""
     package = file.partition("/")[0]
-    tree = ast.parse(source, filename=file)
-    for module, line, when in sorted({(name.partition(".")[0], line, when) for name, line, when in imports(tree)}):
+    for module, line in sorted({(name.partition(".")[0], line) for name, line in imports(source)}):
         if RANK.get(module, 0) > RANK[package]:
             yield f"{file}:{line}: {package} imports {module}, upwards"
         elif module in NOT_IN.get(package, ()):
             yield f"{file}:{line}: {package} knows no {module}"
         elif module in BEHIND and file not in BEHIND[module]:
             yield f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}"
-        elif module == "torch" and when == "at import" and file not in TORCH_AT_IMPORT:
-            yield f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}"
 
 
 @pytest.mark.parametrize("package", RANK)
@@ -87,7 +71,7 @@ def test_none_import_each_other_in_a_circle(root: Path, parts: int) -> None:
     for name, file in names.items():
         if name in RANK and parts == 2:
             continue  # a package's own file may offer names from anywhere
-        asked = {other for other, _, _ in imports(ast.parse(file.read_text(encoding="utf-8")))} & names.keys()
+        asked = {other for other, _ in imports(file.read_text(encoding="utf-8"))} & names.keys()
         own = ".".join(name.split(".")[:parts])
         found.setdefault(own, set()).update({".".join(other.split(".")[:parts]) for other in asked} - {own, *RANK})
     TopologicalSorter(found).prepare()  # raises CycleError, which names them
@@ -95,10 +79,9 @@ def test_none_import_each_other_in_a_circle(root: Path, parts: int) -> None:
 
 def test_every_package_that_is_imported_is_declared(root: Path) -> None:
     """Stable-Baselines3, which `gridsim.envs.sb3` adapts to, is the user's own."""
-    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {re.split(r"[^\w.-]", line)[0].replace("_", "-") for line in project["dependencies"]}
-    trees = [ast.parse(f.read_text(encoding="utf-8")) for package in RANK for f in (root / package).rglob("*.py")]
-    tops = {name.partition(".")[0] for tree in trees for name, _, _ in imports(tree)} - sys.stdlib_module_names
+    declared = {re.split(r"[^\w.-]", line)[0].replace("_", "-") for line in PROJECT["project"]["dependencies"]}
+    sources = [f.read_text(encoding="utf-8") for package in RANK for f in (root / package).rglob("*.py")]
+    tops = {name.partition(".")[0] for source in sources for name, _ in imports(source)} - sys.stdlib_module_names
     projects = packages_distributions()
     found = {top: {name.replace("_", "-").lower() for name in projects.get(top, ())} for top in tops - set(RANK)}
     assert {top for top, names in found.items() if not names & declared} == {"stable_baselines3"}
@@ -107,11 +90,53 @@ def test_every_package_that_is_imported_is_declared(root: Path) -> None:
 @pytest.mark.parametrize(
     ("module", "banned"),
     [
+        ("gridsim", {"numba", "torch"}),
         ("cluster.workers.worker", {"ray", "torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}),
         ("cluster.workers.ray_pool", {"torch", "mlflow", "pygame", "matplotlib"}),
         ("cluster.commands.cli", {"torch", "mlflow", "pygame"}),
     ],
 )
 def test_a_fresh_process_loads_no_more_than_it_needs(root: Path, module: str, banned: set[str]) -> None:
+    """PyTorch, which costs seconds and 200 MB in each worker, among it."""
     code = f"import sys, {module}; print(*sorted({banned!r} & set(sys.modules)))"
     assert finish("python", "-c", code, cwd=root).stdout.split() == []
+
+
+# --- What is installed -----------------------------------------------------------------------------------------------
+
+
+def test_every_folder_is_a_package_and_typed_and_files_that_are_no_python_are_packaged(root: Path) -> None:
+    tops = {pattern.removesuffix("*") for pattern in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]}
+    assert tops == {"cluster", "evolution", "gridsim"}
+    folders = {path.parent for top in tops for path in (root / top).rglob("*.py")}
+    assert [folder for folder in sorted(folders) if not (folder / "__init__.py").is_file()] == []
+    assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
+    patterns = PROJECT["tool"]["setuptools"]["package-data"]["cluster"]
+    packaged = {path.name for pattern in patterns for path in (root / "cluster").glob(pattern)}
+    assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml", "drive.html"}
+
+
+def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path) -> None:
+    def said(target: str) -> str:
+        command = ["make", "--dry-run", target, f"VENV={tmp_path}"]
+        return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
+
+    def installs(target: str) -> list[str]:
+        return re.findall(r'--editable "(.*)"', said(target))
+
+    for target in ("install", "evolve", "dqn", "compare", "ui", "bench", "pictures"):
+        assert installs(target) == ["."]
+    for target in ("develop", "test", "lint", "format"):
+        assert installs(target) == [".[dev]"]
+    assert f"touch {tmp_path}/.installed {tmp_path}/.installed-dev" in said("test")  # it has what a user needs, too
+    (tmp_path / ".installed").touch()
+    assert (installs("evolve"), installs("test")) == ([], [".[dev]"])
+    (tmp_path / ".installed-dev").touch()
+    assert (installs("evolve"), installs("test")) == ([], [])
+
+
+def test_make_help_names_every_target(root: Path) -> None:
+    done = subprocess.run(["make", "help"], cwd=root, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    (targets,) = re.findall(r"^\.PHONY:(.*)$", (root / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert set(dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", done.stdout, flags=re.MULTILINE))) == set(targets.split())

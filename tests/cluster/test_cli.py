@@ -178,27 +178,39 @@ WRONG = [
     ("--resume-if-exists", "give that, and no --resume"),
     ("--address 127.0.0.1:1", "127.0.0.1:1"),
     ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
+    ("--init MADE/c.npz", "is a mlp:6,7; use --policy mlp:6,7"),
+    ("--config MADE/config.json", "gone.npz"),
+    ("--device cuda", "PyTorch finds no device 'cuda' here; use --device cpu"),
 ]
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a champion, and the configuration of a run that began with one that is gone."""
+    folder, genes = tmp_path_factory.mktemp("made"), np.zeros(PolicySpec.parse("mlp:6,7").size, dtype=np.float32)
+    Champion(genes, "mlp:6,7", "curved", SimConfig()).save(folder / "c.npz")
+    RunFolder(folder, EvolveSettings("curved"), init=str(folder / "gone.npz")).write_config()
+    return folder
+
+
 @pytest.mark.parametrize(("arguments", "expected"), WRONG)
-def test_wrong_use_is_one_clear_line(arguments, expected, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert expected in refused(evolve_main, monkeypatch, capsys, *arguments.split())[0]
-    assert list(tmp_path.iterdir()) == []  # nothing half-written
+def test_wrong_use_is_one_clear_line(made, arguments, expected, monkeypatch, capsys, here):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    main = dqn_main if "--device" in arguments else evolve_main
+    assert expected in refused(main, monkeypatch, capsys, *arguments.replace("MADE", str(made)).split())[0]
+    assert list(here.iterdir()) == []  # nothing half-written
 
 
 @pytest.mark.parametrize(("flag", "path"), [("--resume", "old"), ("--config", "old/config.json")])
-def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "old"
+def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypatch, capsys, here):
+    folder = here / "old"
     folder.mkdir()
     for form in (1, 2):
         config = {"format": form, "command": "gridsim-evolve", "settings": {"scenario": "curved"}}
         (folder / "config.json").write_text(json.dumps(config))
         (line,) = refused(evolve_main, monkeypatch, capsys, flag, path)
         assert "old/config.json is of an earlier GridSim, whose runs this one cannot continue; start a new run" in line
-        assert (os.listdir(tmp_path), os.listdir(folder)) == (["old"], ["config.json"])
+        assert (os.listdir(here), os.listdir(folder)) == (["old"], ["config.json"])
 
 
 @pytest.fixture
@@ -207,8 +219,7 @@ def stopped(tmp_path):
     run = RunFolder(tmp_path / "r", EvolveSettings("curved", population=48, generations=6, seed=5))
     run.path.mkdir()
     run.write_config()
-    meta = {"generation": 3, "car_steps": 9, "solved": False, "digest": run.digest()}
-    save(run.path / "checkpoint.npz", {}, meta)
+    save(run.path / "checkpoint.npz", {}, {"generation": 3, "car_steps": 9, "solved": False, "digest": run.digest()})
     return run.path
 
 
@@ -247,27 +258,6 @@ def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
     (stopped / "config.json").write_text(json.dumps(config))
     (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(stopped))
     assert "do not belong together: one of them was edited, or another version of GridSim wrote them" in line
-
-
-def test_a_device_that_is_not_there_is_said(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    (line,) = refused(dqn_main, monkeypatch, capsys, "--device", "cuda")
-    assert "PyTorch finds no device 'cuda' here; use --device cpu" in line
-
-
-def test_a_champion_that_does_not_fit_is_refused(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    genes = np.zeros(PolicySpec.parse("mlp:6,7").size, dtype=np.float32)
-    Champion(genes, "mlp:6,7", "curved", SimConfig()).save("c.npz")
-    (line,) = refused(evolve_main, monkeypatch, capsys, "--init", "c.npz")
-    assert "is a mlp:6,7; use --policy mlp:6,7" in line
-
-
-def test_config_of_a_run_that_began_with_a_champion_begins_with_it_again(monkeypatch, capsys, tmp_path):
-    RunFolder(tmp_path, EvolveSettings("curved"), init=str(tmp_path / "gone.npz")).write_config()
-    (line,) = refused(evolve_main, monkeypatch, capsys, "--config", str(tmp_path / "config.json"))
-    assert "gone.npz" in line
 
 
 @pytest.mark.parametrize("main", [evolve_main, compare_main])

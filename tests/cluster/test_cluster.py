@@ -48,7 +48,7 @@ def pinned(config: dict[str, Any]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", LAUNCHED)
-def test_file_fits_rays_schema(root: Path, name: str) -> None:
+def test_file_fits_rays_schema_and_gives_each_machine_the_project_and_the_token(root: Path, name: str) -> None:
     schema = json.loads(Path(str(distribution("ray").locate_file("ray/autoscaler/ray-schema.json"))).read_text())
     config = read(root, name)
     jsonschema.validate(config, schema)
@@ -57,11 +57,6 @@ def test_file_fits_rays_schema(root: Path, name: str) -> None:
         assert config["head_node_type"] in config["available_node_types"]
         largest = sum(kind.get("max_workers", 0) for kind in config["available_node_types"].values())
         assert config["max_workers"] == largest
-
-
-@pytest.mark.parametrize("name", LAUNCHED)
-def test_file_gives_each_machine_the_project_and_the_token(root: Path, name: str) -> None:
-    config = read(root, name)
     mounts = config["file_mounts"]
     assert mounts.pop("~/.ray/auth_token") == "~/.ray/auth_token"
     assert set(PACKAGES) < set(mounts.values())
@@ -110,16 +105,12 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
         if group is workers:
             assert group["minReplicas"] <= group["replicas"] <= group["maxReplicas"]
             assert group["replicas"] * int(container["resources"]["limits"]["cpu"]) == parsed.work.workers
-            probed = container["readinessProbe"]["tcpSocket"]["port"]
-            assert probed == int(group["rayStartParams"]["node-manager-port"])
+            assert container["readinessProbe"]["tcpSocket"]["port"] == int(group["rayStartParams"]["node-manager-port"])
     (mount,) = container["volumeMounts"]  # of the head, which came last
     assert parsed.work.output == mount["mountPath"]
     assert parsed.work.tracking_uri.startswith(f"sqlite:///{mount['mountPath']}/")
     claim = pod["volumes"][0]["persistentVolumeClaim"]["claimName"]
     assert claim == documents["PersistentVolumeClaim"]["metadata"]["name"]
-
-
-def test_the_guide_names_the_files_that_there_are(root: Path) -> None:
     guide = (root / "docs" / "cluster.md").read_text(encoding="utf-8")
     assert set(re.findall(r"cluster/(\w+)\.yaml", guide)) == {*LAUNCHED, "kuberay"}
 

@@ -35,10 +35,9 @@ if [ -e "away-$name" ]; then echo "gridsim-evolve: warning: not logged to MLflow
 """
 
 
-def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    write_plan(tmp_path, PLAN)
-    make_run(tmp_path / "a")
+def test_wrong_use_is_told_in_one_line(here, monkeypatch, capsys):
+    write_plan(here, PLAN)
+    make_run(here / "a")
     wrong: list[tuple[list[object], str]] = [
         (["nowhere"], "not a run's folder"),
         (["."], "none of its runs is finished"),
@@ -53,17 +52,16 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     ]
     for arguments, said in wrong:
         assert said in refused(compare_main, monkeypatch, capsys, *arguments)[0]
-    assert sorted(os.listdir(tmp_path)) == ["a", "comparison.json"]
+    assert sorted(os.listdir(here)) == ["a", "comparison.json"]
 
 
 @pytest.fixture
-def made(tmp_path, monkeypatch, capsys):
-    """gridsim-compare in `tmp_path`, with STAND_IN in place of the learners' commands and without MLflow."""
-    monkeypatch.chdir(tmp_path)
-    script = tmp_path / "gridsim-evolve"  # beside `call`'s gridsim-compare
+def made(here, monkeypatch, capsys):
+    """gridsim-compare in `here`, with STAND_IN in place of the learners' commands and without MLflow."""
+    script = here / "gridsim-evolve"  # beside `call`'s gridsim-compare
     script.write_text(STAND_IN)
     script.chmod(0o755)
-    for planned in PLAN.planned(tmp_path / "made"):
+    for planned in PLAN.planned(here / "made"):
         make_run(planned.path, settings=planned.settings)
     tracking: Any = Mock(uri="http://u:hunter2@h:5000", error="no answer", run_id="", close=lambda status: None)
     tracking.wait_id.return_value = "17"

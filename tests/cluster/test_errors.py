@@ -1,24 +1,23 @@
-"""Velocity and steering errors: closed forms on a straight and a circle, and what the command prints."""
+"""Velocity and steering errors, and the reference driver's profile: closed forms on a straight and a circle."""
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import call, refused
+from commands import CHAMPION, call, refused
 
 from cluster.commands.cli import evaluate_main
 from cluster.compare.results import series
 from cluster.store.champion import load_champion
 from gridsim.config import VehicleConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.reference import BRAKING, LATERAL, Series, error_series, top_speed
+from gridsim.reference import ACCELERATION, BRAKING, LATERAL, Series, arc_length, error_series, profile, top_speed
 from gridsim.reference import errors as errors_of
 
-TOP = top_speed(REGISTRY["seamless"].speed_interval)
+INTERVAL = REGISTRY["seamless"].speed_interval
+TOP = top_speed(INTERVAL)
 CAR = VehicleConfig()
-CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +105,6 @@ def test_who_came_nowhere_cannot_be_compared(road, poses):
 
 
 def constant(metres, speed, reference, degrees):
-    """A drive at constant speeds (m/s), with the wheels so far off."""
     arc, one = np.array([0.0, metres]), np.ones(2)
     return Series(arc, speed * one, reference * one, math.radians(degrees) * one, 0.0 * one)
 
@@ -143,3 +141,26 @@ def test_the_command_measures_a_champion_against_the_reference_driver(monkeypatc
     for words in ("success (2,000 m without a collision)", "velocity error, m/s", "steering error, degrees"):
         assert words in shown
     assert "traffic must be 0 to 100" in refused(evaluate_main, monkeypatch, capsys, CHAMPION, "--traffic", -2)[0]
+
+
+# --- The profile -----------------------------------------------------------------------------------------------------
+
+
+def test_profile_of_a_straight_is_flat_out_and_then_steady():
+    points = np.stack([np.linspace(0.0, 200.0, 401), np.full(401, 3.0)], axis=1)
+    speed, steering = profile(points, INTERVAL, 0.0, CAR)
+    assert speed[[0, 6, 20, 200]] == pytest.approx([0.0, math.sqrt(18.0), math.sqrt(60.0), TOP], rel=1e-6)
+    assert steering == pytest.approx(0.0, abs=1e-12)
+    assert profile(points, INTERVAL, TOP, CAR)[0][0] == pytest.approx(TOP)
+
+
+def test_profile_brakes_and_accelerates_no_harder_than_it_may():
+    """A bend of 12 m radius to the right, between two straights."""
+    heading = np.interp(np.arange(0.0, 240.0, 0.5), [100.0, 100.0 + 12.0 * math.pi], [0.0, -math.pi])
+    points = 0.5 * np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    speed, steering = profile(points, INTERVAL, 2.0, CAR)
+    rate = np.diff(speed**2) / (2.0 * np.diff(arc_length(points)))
+    assert -BRAKING - 1e-6 <= rate.min() < -1.0
+    assert 1.0 < rate.max() <= ACCELERATION + 1e-6
+    assert np.abs(steering).max() <= math.radians(27.0) + 1e-9
+    assert 2.0 < speed[1:].min() < speed.max() <= TOP + 1e-9

@@ -7,12 +7,11 @@ import shutil
 import subprocess
 import sys
 from html import unescape
-from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import pytest
-from commands import BIN, PATH, call, finish, refused
+from commands import BIN, CHAMPION, PATH, call, finish, refused
 from finished_runs import make_run, with_errors
 from pictures import small_map
 
@@ -23,7 +22,6 @@ from cluster.commands.watch import watch_main
 from cluster.report import pictures
 from gridsim.state import CAR_FIELDS as FIELDS
 
-CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 ODD = "a  b ?#%;&'\"[b] $x (c)"
 
 
@@ -71,21 +69,19 @@ def test_commands_that_are_printed_can_be_pasted_in_folders_of_any_name(tmp_path
         (compare_main, ["a  b/run"], "a  b/run is not finished", "a  b/run"),
     ],
 )
-def test_the_path_of_a_command_in_a_message_is_quoted(main, arguments, said, path, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_path_of_a_command_in_a_message_is_quoted(main, arguments, said, path, here, monkeypatch, capsys):
     for folder in ("a  b", "-a"):
-        make_run(tmp_path / folder / "run")
+        make_run(here / folder / "run")
         for name in ("champion.npz", "summary.json"):
-            (tmp_path / folder / "run" / name).unlink()
+            (here / folder / "run" / name).unlink()
     line, *_ = refused(main, monkeypatch, capsys, *arguments)
     assert said in line
     assert shlex.split(re.split("--(?:resume|config) ", line)[-1]) == [path]
 
 
-def test_a_name_is_no_markup_and_its_spaces_stay(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "x[").mkdir()
-    shutil.copy(CHAMPION, tmp_path / "x[/b]:car:")
+def test_a_name_is_no_markup_and_its_spaces_stay(here, monkeypatch, capsys):
+    (here / "x[").mkdir()
+    shutil.copy(CHAMPION, here / "x[/b]:car:")
     code, out, _ = call(evaluate_main, monkeypatch, capsys, "x[/b]:car:", "--episodes", 1)
     assert (code, out.partition(" on ")[0]) == (0, "x[/b]:car:")
     assert "no  such is not a run's folder" in refused(evolve_main, monkeypatch, capsys, "--resume", "no  such")[0]
@@ -102,8 +98,7 @@ def test_a_name_is_no_markup_and_its_spaces_stay(tmp_path, monkeypatch, capsys):
         (compare_main, ["--resume", "NAME"]),
     ],
 )
-def test_a_name_that_is_too_long_is_told_in_one_line(main, arguments, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_name_that_is_too_long_is_told_in_one_line(main, arguments, here, monkeypatch, capsys):
     name = "ü" * 150  # 300 bytes
     line, *_ = refused(main, monkeypatch, capsys, *(str(each).replace("NAME", name) for each in arguments))
     assert f"{name}" in line
@@ -124,16 +119,15 @@ def test_a_name_that_the_terminal_cannot_show_is_no_error(encoding, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="its file names are UTF-8")
-def test_names_of_any_bytes_are_drawn_and_compared(tmp_path, monkeypatch, capsys):
+def test_names_of_any_bytes_are_drawn_and_compared(here, monkeypatch, capsys):
     name = os.fsdecode(b"M\xfcller $5 $x^ <b>")
     states = np.zeros((20, FIELDS), dtype=np.float32)
-    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]]), states, tmp_path / "drive.png", f"{name} 漢")
-    make_run(tmp_path / "run")
-    (tmp_path / "run").rename(tmp_path / name)
-    (tmp_path / name / "drive.html").touch()
-    monkeypatch.chdir(tmp_path)
+    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]]), states, here / "drive.png", f"{name} 漢")
+    make_run(here / "run")
+    (here / "run").rename(here / name)
+    (here / name / "drive.html").touch()
     monkeypatch.setattr(compare, "measured", with_errors)
     assert call(compare_main, monkeypatch, capsys, name, "--name", "c")[0] == 0
-    (link,) = re.findall(rb'<a href="(.*?)">', (tmp_path / "runs/c/comparison.html").read_bytes())
+    (link,) = re.findall(rb'<a href="(.*?)">', (here / "runs/c/comparison.html").read_bytes())
     assert unquote_to_bytes(unescape(link.decode())) == os.fsencode(f"../../{name}/drive.html")
-    assert os.fsencode(name) in (tmp_path / "runs/c/table.csv").read_bytes()
+    assert os.fsencode(name) in (here / "runs/c/table.csv").read_bytes()

@@ -20,8 +20,7 @@ from gridsim.car.vehicle import act
 from gridsim.config import constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.state import CAR_FIELDS as FIELDS
-from gridsim.state import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
+from gridsim.state import CAR_FIELDS, COS, DISTANCE, SIN, SPEED, STEERING, X, Y
 from gridsim.traffic.world import spawn
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion_traffic.npz"
@@ -120,7 +119,7 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
 def test_the_picture_of_a_drive_over_the_edge_has_no_line_across(tmp_path, monkeypatch):
     figure = pictures.figure_of(4.0, 3.0)
     monkeypatch.setattr(pictures, "figure_of", lambda *size: figure)
-    states = np.zeros((20, FIELDS), dtype=np.float32)
+    states = np.zeros((20, CAR_FIELDS), dtype=np.float32)
     states[:, X], states[:, Y] = np.arange(50, 90, 2) % 64, 32.0
     pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]]), states, tmp_path / "drive.png", "a drive")
     (lines,) = (each for each in figure[1][0].collections if isinstance(each, LineCollection))

@@ -14,7 +14,7 @@ from typing import Any
 import psutil  # type: ignore[import-untyped]
 import pytest
 from commands import finish, wait_until
-from driving import to_bytes
+from searching import to_bytes
 from test_pool import Answering, make_collect_task, make_recipes, make_task, never_built
 
 from cluster.workers.address import cluster_address

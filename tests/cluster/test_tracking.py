@@ -203,28 +203,22 @@ def test_two_at_once_create_one_database_and_print_nothing(tmp_path):
 
 
 def test_git_commit(tmp_path):
-    def git(*arguments):
-        identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main"]
-        command = ["git", *identity, "-C", str(tmp_path / "repository"), *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main", "-C", str(tmp_path)]
 
-    def told(**environment):
-        script, place = "from commit import git_commit; print(git_commit())", str(tmp_path / "repository")
-        done = finish("python", "-c", script, cwd="/", PYTHONPATH=place, **environment)
+    def told(*steps, **environment):
+        """Of a file in this folder, once git has done these."""
+        for step in steps:
+            subprocess.run([*git, *step.split()], check=True, capture_output=True)
+        script = "from commit import git_commit; print(git_commit())"
+        done = finish("python", "-c", script, cwd="/", PYTHONPATH=str(tmp_path), **environment)
         assert done.stderr == ""
         return done.stdout.strip()
 
-    (tmp_path / "repository").mkdir()
-    shutil.copy(cluster.tracking.commit.__file__, tmp_path / "repository")
-    assert told() == "unknown"
-    git("init")
-    git("add", "commit.py")
-    assert told() == "unknown"
-    git("commit", "-m", "first")
-    commit = git("rev-parse", "HEAD")
+    file = shutil.copy(cluster.tracking.commit.__file__, tmp_path)
+    assert told() == told("init", "add commit.py") == "unknown"
+    commit = told("commit -m first")
     assert re.fullmatch("[0-9a-f]{40}", commit)
-    assert told() == commit
     assert told(PATH="/nowhere") == "unknown"
-    with (tmp_path / "repository/commit.py").open("a") as file:
-        file.write("changed = True\n")
+    with open(file, "a") as changed:
+        changed.write("changed = True\n")
     assert told() == f"{commit}-dirty"

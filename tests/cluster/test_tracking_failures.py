@@ -1,4 +1,4 @@
-"""What goes wrong between a run and MLflow: stores, servers and addresses that fail, stall or are no such thing."""
+"""What goes wrong between a run and MLflow, and stores as people have them: hosted, in odd folders, behind a proxy."""
 
 import contextlib
 import http.server
@@ -10,15 +10,18 @@ import sqlite3
 import subprocess
 import threading
 import time
+import urllib.request
 
 import pytest
-from commands import wait_until
+import requests
+from commands import finish, wait_until
 from tracked import client, free_port, runs, send, steps, tracking, write_run
 
-from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_uri
+from cluster.tracking.database import run_tables
 from cluster.tracking.description import read_run
 from cluster.tracking.logged import LoggedRun
-from cluster.tracking.tracking import sync
+from cluster.tracking.tracking import Tracking, sync
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -141,17 +144,18 @@ def refused(uri):
     return str(caught.value)
 
 
-def test_addresses_become_absolute(tmp_path, monkeypatch, empty_database):
-    (tmp_path / "a folder").mkdir()
-    monkeypatch.chdir(tmp_path)
-    assert check_uri() == f"sqlite:///{tmp_path}/mlflow.db"
-    assert check_uri("sqlite:///a folder/../b.db?timeout=9") == f"sqlite:///{tmp_path}/b.db?timeout=9"
-    assert check_uri(f"sqlite:////{tmp_path}/b.db").endswith(f"{tmp_path}/b.db")
+def test_addresses_become_absolute(here, monkeypatch, empty_database):
+    (here / "a folder").mkdir()
+    assert check_uri() == f"sqlite:///{here}/mlflow.db"
+    assert check_uri("sqlite:///a folder/../b.db?timeout=9") == f"sqlite:///{here}/b.db?timeout=9"
+    assert check_uri(f"sqlite:////{here}/b.db").endswith(f"{here}/b.db")
     assert check_uri(f"sqlite:///{empty_database}") == f"sqlite:///{empty_database}"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///a folder/from the environment.db")
-    assert check_uri() == f"sqlite:///{tmp_path}/a folder/from the environment.db"
-    assert check_uri("sqlite:///given.db") == f"sqlite:///{tmp_path}/given.db"
-    assert os.listdir(tmp_path) == ["a folder"]
+    assert check_uri() == f"sqlite:///{here}/a folder/from the environment.db"
+    assert check_uri("sqlite:///given.db") == f"sqlite:///{here}/given.db"
+    unix = "postgresql://u:p@/db?host=/var/run/postgresql"  # a socket, not looked for on a port
+    assert check_uri(unix) == unix
+    assert os.listdir(here) == ["a folder"]
 
 
 @pytest.mark.parametrize(
@@ -160,18 +164,21 @@ def test_addresses_become_absolute(tmp_path, monkeypatch, empty_database):
         ("mlruns", "no runs in folders"), ("file:///tmp/mlruns", "no runs in folders"), ("sqlite://", "names no file"),
         ("sqlite:///:memory:", "names no file"), ("sqlite:///no/such/folder/mlflow.db", "there is no folder"),
         ("sqlite:///.", "names no file"), ("sqlite:///text.db", "file is not a database"),
-        ("ftp://host/x", "not a tracking address"), ("http://no-such-host.invalid:5000", "no MLflow server"),
-        ("postgresql://someone:secret@127.0.0.1:1/db", "Connection refused"),
-        ("http://someone:secret@127.0.0.1:1", "Connection refused"), ("http://127.0.0.1:99999", "no MLflow server"),
+        ("sqlite://u:cret@/x.db", "names no file"), ("sqlite:////no/folder/x.db?key=cret", "there is no folder"),
+        ("ftp://u:cret@h", "not a tracking address"), ("u:cret@127.0.0.1/db", "not a tracking address"),
+        ("http://no-such-host.invalid:5000", "no MLflow server"), ("http://127.0.0.1:99999", "no MLflow server"),
+        ("http://u:se/cr@et@127.0.0.1:1", "Connection refused"), ("http://127.0.0.1:1/?token=cret", " refused"),
+        ("postgresql://u:se/cr@et@127.0.0.1:1/db", " refused"), ("mysql://u:cret@127.0.0.1:1/d?token=cret", " refused"),
+        ("postgresql://u:p?cret@127.0.0.1:5999/db", "in a password, write ? as %3F, @ as %40 and / as %2F"),
     ],
 )  # fmt: skip
-def test_addresses_that_cannot_be_used(tmp_path, monkeypatch, uri, reason):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
+def test_addresses_that_cannot_be_used_are_shown_without_their_secrets(here, uri, reason):
+    (here / "text.db").write_text("some text, which is no database at all\n" * 100)
     text = refused(uri)
     assert reason in text
-    assert "secret" not in text
-    assert os.listdir(tmp_path) == ["text.db"]
+    assert not re.search("cret|se/", text)
+    assert os.listdir(here) == ["text.db"]
+    assert sync(write_run(here / "a", 1), uri, "", read_run)[1] == f"could not upload to MLflow: {text}"
 
 
 def test_what_else_may_answer(silent, impatient):
@@ -205,3 +212,70 @@ def test_what_else_may_answer(silent, impatient):
             assert check_uri(f"{uri}{path}/") == f"{uri}{path}"
         server.shutdown()
     assert "no answer in time" in refused(silent)
+
+
+# --- Stores ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_in_a_folder_with_an_odd_name(tmp_path, monkeypatch):
+    folder, elsewhere = tmp_path / "what now? #1 100%41;a&b'\" ü [c]", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    monkeypatch.chdir(folder)
+    _, run_id = send(write_run(folder / "runs/a", 2, success_rate=0.5), "")
+    assert sorted(os.listdir(folder)) == ["mlartifacts", "mlflow.db", "runs"]
+    monkeypatch.chdir(elsewhere)
+    assert send(folder / "runs/a", "") == ("", run_id)
+    assert os.listdir(elsewhere) == []
+    assert (folder / "mlartifacts" / run_id / "artifacts/model/MLmodel").is_file()
+    assert list(run_tables(sqlite_uri(folder / "mlflow.db"), "http://127.0.0.1:5000")) == ["driving"]
+
+
+@pytest.mark.parametrize("revision", ["unheard of", "0584bdc529eb"])  # the latter of MLflow 2.19
+def test_a_database_of_another_mlflow_is_refused_before_it_is_migrated(tmp_path, revision):
+    path = tmp_path / "mlflow.db"
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE alembic_version (version_num VARCHAR(32))")
+        database.execute("INSERT INTO alembic_version VALUES (?)", (revision,))
+        database.commit()
+    before, uri = path.read_bytes(), f"sqlite:///{path}"
+    said = (
+        f"{uri} was made by another version of MLflow, or by another program; use another --tracking-uri, or copy it "
+        f"and run mlflow db upgrade {uri}, after which an older MLflow cannot open it"
+    )
+    with pytest.raises(TrackingError, match=f"^{re.escape(said)}$"):
+        check_uri(uri)
+    done = finish("python", "-m", "cluster.commands.ui", str(free_port()), cwd=tmp_path, code=1)
+    assert done.stderr == f"make ui: {said}\n"
+    refused = tracking(write_run(tmp_path / "a", 1), uri)  # as tracking says of a database server
+    assert (refused.wait_id(30), refused.error) == ("", said)
+    refused.close("KILLED")
+    assert path.read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ["a", "mlflow.db"]
+
+
+def test_hosted_stores_and_those_of_plug_ins_are_left_to_mlflow(tmp_path, monkeypatch):
+    plugin = tmp_path / "filetest-1.0.dist-info"
+    plugin.mkdir()
+    (plugin / "METADATA").write_text("Metadata-Version: 2.1\nName: filetest\nVersion: 1.0\n")
+    (plugin / "entry_points.txt").write_text("[mlflow.tracking_store]\nfiletest = filetest:tracking\n")
+    with pytest.raises(TrackingError, match=r"^filetest://x: not a tracking address"):
+        check_uri("filetest://x")
+    monkeypatch.syspath_prepend(tmp_path)
+    for uri in ("databricks", "databricks://profile", "filetest://x"):
+        assert check_uri(uri) == check_uri(begun_with=uri) == uri
+        assert Tracking(tmp_path, uri, "", read_run).where("mlflow") == uri
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [("", "127.0.0.1,localhost,::1,[::1]"), ("a", "a,127.0.0.1,localhost,::1,[::1]"), ("*", "*")]
+)
+def test_this_machine_is_never_asked_through_a_proxy(monkeypatch, before, after):
+    monkeypatch.setenv("http_proxy", "http://p:1")
+    monkeypatch.setenv("no_proxy", before)
+    reach_loopback_directly()
+    reach_loopback_directly()
+    assert os.environ["no_proxy"] == after
+    for host in ("127.0.0.1", "localhost", "[::1]"):
+        assert requests.utils.should_bypass_proxies(f"http://{host}:5000", None)
+        assert urllib.request.proxy_bypass(f"{host}:5000")

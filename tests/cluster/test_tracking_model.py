@@ -1,11 +1,16 @@
-"""The champion in MLflow's registry: an ONNX model that MLflow loads without GridSim, registered once."""
+"""The champion in MLflow's registry, which MLflow loads without GridSim, and what MLflow is told of a run."""
+
+import re
 
 import pytest
-from tracked import MODEL, client, runs, send, tracking, write_run
+from tracked import HELD_OUT, MODEL, client, runs, send, tracking, write_run
 
+from cluster.learn.dqn import Dqn
+from cluster.learn.evolution import Evolution
+from cluster.settings import DqnSettings, EvolveSettings
 from cluster.store.champion import load_champion
 from cluster.tracking.address import check_uri
-from cluster.tracking.description import read_run
+from cluster.tracking.description import NOT_LOGGED, group, held_out_metrics, model_name, read_run
 from cluster.tracking.tracking import sync
 from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
@@ -80,3 +85,24 @@ def test_a_registry_that_is_elsewhere_and_away_is_named(uri, tmp_path, monkeypat
     monkeypatch.setenv("MLFLOW_REGISTRY_URI", other)
     assert send(folder, uri) == ("1 model", run.info.run_id)
     assert client(uri).get_model_version_by_alias(MODEL, "best").run_id == run.info.run_id
+
+
+def test_seeds_are_one_group_and_nothing_else_is():
+    def of(kind=EvolveSettings, **settings):
+        return group(kind("curved", **settings))
+
+    assert of() == of(seed=1) == of(generations=5) == "curved evolution mlp:64+steering"
+    others = [
+        of(population=64), of(policy="mlp:8"), of(traffic=3), of(search="random"), of(observation="grid"),
+        of(sigma=0.1), of(recombination="two"), of(DqnSettings), of(DqnSettings, discount=0.9),
+        of(DqnSettings, observation="grid"),
+    ]  # fmt: skip
+    assert len({of(), *others}) == 1 + len(others)
+    assert of(population=64, sigma=0.1) == "curved evolution mlp:64+steering, population 64, sigma 0.1"
+    assert of(search="random", traffic=3) == "curved random mlp:64+motion+steering 3 cars"
+    assert model_name(EvolveSettings("maps/my town@2.png")) == "gridsim-my_town_2-evolution"
+
+
+def test_every_metric_is_explained(root):
+    explained = set(re.findall(r"^\| `([^`]+)`", (root / "docs/mlflow.md").read_text(), re.MULTILINE))
+    assert {*Evolution.columns, *Dqn.columns, *held_out_metrics(HELD_OUT)} - {*NOT_LOGGED} <= explained

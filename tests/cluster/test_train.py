@@ -1,12 +1,18 @@
-"""A run's lifecycle: how it ends, what its caller is told, and what it leaves."""
+"""A run's lifecycle: how it ends, what its caller is told, what it leaves; what signals do."""
 
 import dataclasses
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from contextlib import nullcontext
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from commands import call
+from commands import call, start, wait_until
 from learners import Untracked
 
 from cluster import run as module
@@ -21,8 +27,6 @@ SETTINGS = EvolveSettings("curved", policy="mlp:4", population=8, generations=2)
 
 
 class Told(Untracked):
-    """What MLflow is told in the end."""
-
     ends: ClassVar[list[str]] = []
     outages: ClassVar[list[str | None]] = []
 
@@ -116,11 +120,75 @@ def test_a_limit_of_wall_time_counts_what_was_before(tmp_path, monkeypatch):
         (FloatingPointError("diverged"), r"diverged\nrepeat it with: \S+ --config r/config.json --learning-rate ..."),
     ],
 )
-def test_a_run_that_fails_exits_with_1_and_says_how_to_go_on(tmp_path, monkeypatch, capsys, error, said):
+def test_a_run_that_fails_exits_with_1_and_says_how_to_go_on(here, monkeypatch, capsys, error, said):
     monkeypatch.setattr(Session, "finish", end(error))
-    monkeypatch.chdir(tmp_path)
     small = ["--scenario", "curved", "--policy", "mlp:4", "--population", 8, "--generations", 1]
     code, _, err = call(evolve_main, monkeypatch, capsys, *small, "--output", ".", "--name", "r")
     assert code == 1
     assert re.search(f"^gridsim-evolve: error: {said}\n$", err, re.MULTILINE)
     assert "gridsim-evolve: warning: 2 rows are not sent\n" in err
+
+
+# --- Signals ---------------------------------------------------------------------------------------------------------
+
+LISTEN = """
+import sys, time
+from cluster import stopping
+stopping.listen()
+print("begun", flush=True)
+while not stopping.requested():
+    time.sleep(0.01)
+print("asked", flush=True)
+time.sleep(float(sys.argv[1]))
+stopping.check()
+"""
+
+
+def listening(seconds):
+    """A process that listens, and then takes so many seconds to stop."""
+    process = subprocess.Popen([sys.executable, "-c", LISTEN, str(seconds)], stdout=-1, stderr=-1, text=True)
+    assert process.stdout
+    assert process.stdout.readline() == "begun\n"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_sets_a_flag_and_stops_where_it_is_looked_at(number):
+    with listening(0.0) as process:
+        process.send_signal(number)
+        out, err = process.communicate(timeout=30)
+    assert out == "asked\n"
+    assert err.splitlines()[-1] == "cluster.stopping.Stopped"
+
+
+def test_a_second_signal_ends_at_once_but_one_that_is_passed_on_does_not():
+    """`make` and `uv run` pass on what the terminal sends to all."""
+    with listening(60.0) as process:
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "asked\n"
+        process.send_signal(signal.SIGTERM)
+        time.sleep(stopping.ONE_SIGNAL_S + 0.1)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+
+
+def test_signals_that_the_shell_ignores_stay_ignored(monkeypatch):
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)}
+    try:
+        stopping.listen()
+        assert [signal.getsignal(number) for number in before] == [signal.SIG_IGN] * 2
+        assert signal.getsignal(signal.SIGTERM) is stopping._stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("prog", ["gridsim-evolve", "gridsim-evaluate", "gridsim-compare"])
+def test_a_command_is_quiet_if_it_is_stopped_while_its_libraries_load(prog, tmp_path):
+    with start(prog, "--help", cwd=tmp_path) as process:
+        loaded = Path(f"/proc/{process.pid}/maps")
+        wait_until(lambda: process.poll() is not None or "numpy" in loaded.read_text(), 30, 0.005)
+        os.kill(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, "", "")

@@ -1,4 +1,4 @@
-"""What searches share: ranks within groups, tournaments in closed form, groups of pairs, the order of ask and tell."""
+"""Searches: children from recipes, fitness, ranks, tournaments, the (CSA-)ES beside CMA-ES, the genetic algorithm."""
 
 import itertools
 
@@ -7,14 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from searching import state_of
+from searching import first_gene, new_genomes, state_of, told
 
-from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import RESULT
+from evolution.networks.policy import PolicySpec, gene_scales
+from evolution.networks.symmetry import symmetry
 from evolution.search.base import SearchConfig, ranks, split, tournament_weights, tournaments
+from evolution.search.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, noise_sum
+from evolution.search.fitness import PACED_ENOUGH, scalar
 from evolution.search.recombination import Recombination
-from evolution.search.two_parents import TwoParents
+from evolution.search.two_parents import PARENTS, TwoParents
 
+F = np.float32
 SPEC = PolicySpec.parse("mlp:1")
+GENES = SPEC.size  # 49
 SEARCHES = [Recombination, TwoParents]
 few = st.integers(0, 4)  # scores that are often equal
 
@@ -81,7 +87,6 @@ def test_the_first_generation_is_new_and_each_has_a_key_of_its_own(kind):
 
 @pytest.mark.parametrize("kind", SEARCHES)
 def test_a_score_that_is_not_a_number_loses(kind):
-    """The search goes as if it were lower than all others'."""
     states = []
     for spoilt in (np.nan, -np.inf, -1e300):
         search = kind(SPEC, SearchConfig(population=16, groups=2, tournament=4), seed=6)
@@ -92,3 +97,305 @@ def test_a_score_that_is_not_a_number_loses(kind):
             search.tell(scores)
         states.append(state_of(search))
     assert states[0] == states[1] == states[2]
+
+
+# --- Fitness ---------------------------------------------------------------------------------------------------------
+
+TARGET = 500.0
+
+
+def results(distance, paced):
+    """RESULT [n, e] of distances and paced distances [n, e]."""
+    made = np.zeros(np.shape(distance), dtype=RESULT)
+    made["distance"], made["paced"] = distance, paced
+    return made
+
+
+def worth(*drives):
+    """The fitness of members with one episode each, given as (metres, paced metres)."""
+    distance, paced = np.array(drives, dtype=float).T[:, :, None]
+    return scalar(results(distance, paced), TARGET).tolist()
+
+
+metres = st.floats(0.0, 1000.0, width=32)
+episodes = st.lists(st.tuples(metres, st.floats(0.0, 1.0)), min_size=1, max_size=6)  # distance, share that was paced
+
+
+@given(drives=episodes, which=st.integers(0, 5), more=st.floats(0.5, 100.0))
+def test_further_and_better_paced_is_never_worse(drives, which, more):
+    row = results([[d for d, _ in drives]], [[d * share for d, share in drives]])
+    further, paced = row.copy(), row.copy()
+    k = which % len(drives)
+    further["distance"][0, k] += more
+    paced["paced"][0, k] += more
+    for better in (further, paced):
+        assert scalar(better, TARGET)[0] >= scalar(row, TARGET)[0]
+    if further["distance"][0, k] < TARGET:
+        assert scalar(further, TARGET)[0] > scalar(row, TARGET)[0]
+        if paced["paced"][0, k] < PACED_ENOUGH * row["distance"][0, k]:
+            assert scalar(paced, TARGET)[0] > scalar(row, TARGET)[0]
+
+
+def test_what_metres_are_worth():
+    assert worth((0, 0), (TARGET, TARGET), (3 * TARGET, 3 * TARGET)) == pytest.approx([0.0, 1.0, 1.0], abs=0.0)
+    nothing, first_bend, far, further = worth((0, 0), (20, 20), (400, 400), (420, 420))
+    assert first_bend - nothing > 5 * (further - far)
+    unpaced, paced = worth((400, 0), (120, 120))  # 0.7 of the score is for paced metres, 0.3 for all
+    assert unpaced == pytest.approx(paced)
+    whole, enough, less = worth((400, 400), (400, 320), (400, 310))  # a fifth may be outside the interval
+    assert whole == enough > less
+
+
+# --- The default search ----------------------------------------------------------------------------------------------
+
+
+def begun(config, seed=1):
+    search = Recombination(SPEC, config, seed)
+    search.start_from(np.random.default_rng(seed).normal(size=GENES).astype(F))
+    return search
+
+
+def test_the_first_centre_is_the_best_of_a_random_generation():
+    search = Recombination(SPEC, SearchConfig(population=40, groups=4), seed=1)
+    members = told(search, first_gene)
+    assert np.asarray(search.leader()).tobytes() == members[first_gene(members).argmax()].tobytes()
+    assert search.sigma == search.config.sigma
+
+
+def test_the_champion_is_the_second_member_bit_for_bit():
+    search = begun(SearchConfig(population=16, groups=2))
+    champion = np.random.default_rng(3).normal(size=GENES).astype(F)
+    champion[:2] = -0.0, 1e-42
+    search.champion = champion
+    asked = search.ask()
+    members = search.genomes(np.arange(16))
+    assert members[0].tobytes() == search.centre.astype(F).tobytes()
+    assert members[1].tobytes() == champion.tobytes()
+    assert asked.recipes["kind"].tolist() == [Kind.COPY] * 2 + [Kind.STEP, Kind.MIRRORED] * 7
+    assert asked.recipes["seed"][2:].tolist() == [k // 2 for k in range(14)]
+    assert asked.groups == [slice(0, 10), slice(10, 16)]  # which cut no pair
+    search.tell(np.arange(16) == 1.0)  # who alone wins is the next centre, but for those it ties with by chance
+    moved, way = search.centre - members[0], champion - members[0]
+    assert moved @ way / np.linalg.norm(moved) / np.linalg.norm(way) > 0.95
+
+
+@pytest.mark.parametrize("champion", [False, True])
+def test_the_centre_moves_twice_as_far_as_to_the_weighted_mean_of_the_members_and_its_average_follows(champion):
+    search = begun(SearchConfig(population=40, groups=4, tournament=3))
+    if champion:
+        search.champion = np.random.default_rng(4).normal(size=GENES).astype(F)
+    asked = search.ask()
+    members, scores = search.genomes(np.arange(40)).astype(float), np.random.default_rng(5).random(40)
+    before, average = search.centre, search.average
+    search.tell(scores)
+    mean = tournament_weights(ranks(scores, asked.groups), 3) @ members
+    np.testing.assert_allclose(search.centre, before + 2.0 * (mean - before), rtol=2e-5, atol=1e-5)
+    np.testing.assert_allclose(search.average, 0.9 * average + 0.1 * search.centre)
+
+
+def test_equal_scores_move_nothing():
+    search = begun(SearchConfig(population=41, groups=2))
+    before = state_of(search)
+    for score in (0.0, -np.inf, np.nan):
+        told(search, lambda genomes: np.full(len(genomes), score))  # noqa: B023
+        after = state_of(search)
+        assert all(after[name] == before[name] for name in ("centre", "path", "sigma"))
+
+
+@pytest.mark.parametrize(("population", "groups", "tournament"), [(17, 1, 8), (65, 2, 8), (64, 4, 2)])
+def test_where_chance_decides_sigma_does_not_drift(population, groups, tournament):
+    """The path is N(0, 1) in each gene; the step size does as a random walk does."""
+    squares, ends = [], []
+    for seed in range(24):
+        search = begun(SearchConfig(population=population, groups=groups, tournament=tournament), seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(150):
+            told(search, lambda genomes: rng.random(len(genomes)))  # noqa: B023
+            squares.append((search.path**2).mean())
+            assert 0.05 < search.sigma < 5.0
+        ends.append(np.log(search.sigma / search.config.sigma))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.08)
+    assert abs(np.mean(ends)) < 0.5
+
+
+def test_on_a_slope_sigma_grows_to_twice_its_size():
+    way = np.random.default_rng(2).normal(size=GENES)
+    search, sizes = begun(SearchConfig(population=33, groups=1)), []
+    for _ in range(120):
+        told(search, lambda genomes: genomes @ way)
+        sizes.append(search.sigma)
+    assert max(sizes) == 2.0 * search.config.sigma
+    assert np.mean(sizes[-20:]) > 1.5 * search.config.sigma
+    assert search.centre @ way / np.linalg.norm(way) > 50.0
+
+
+# Median of 7 runs of pycma 4.5.0, CMAEvolutionStrategy(x0, 1.0, {"CMA_diagonal": True, "popsize": 33}): evaluations
+# of 49 genes from N(0, 1) until the sum of their squares is 1e-9 of what it is at the start.
+REFERENCE = 7_821
+
+
+@pytest.mark.parametrize("tournament", [4, 8])
+def test_on_a_sphere_it_is_about_as_fast_as_cma_es(tournament):
+    needed = []
+    for seed in range(1, 6):
+        search = begun(SearchConfig(population=33, groups=1, tournament=tournament), seed)
+        goal = 1e-9 * (search.centre**2).sum()
+        while (search.centre**2).sum() > goal and search.generation < 1000:
+            told(search, lambda genomes: -(genomes.astype(float) ** 2).sum(axis=1))
+        needed.append(33 * search.generation)
+    assert np.median(needed) < 2.0 * REFERENCE
+
+
+# --- Two parents, and random search ----------------------------------------------------------------------------------
+
+CONFIG = SearchConfig(population=40, groups=1, tournament=3, sigma=0.5, elites=4)
+EVERYONE = np.arange(CONFIG.population)
+
+
+@pytest.mark.parametrize(("random", "kind"), [(False, Kind.CROSS), (True, Kind.NEW)])
+def test_elites_go_on_bit_identical_best_first(random, kind):
+    search = TwoParents(SPEC, CONFIG, seed=1, random=random)
+    before = told(search, first_gene)
+    for _ in range(5):
+        best = np.argsort(-first_gene(before), kind="stable")[: CONFIG.elites]
+        asked = search.ask()
+        assert (asked.recipes["kind"][: CONFIG.elites] == Kind.COPY).all()
+        assert (asked.recipes["kind"][CONFIG.elites :] == kind).all()
+        now = search.genomes(EVERYONE)
+        assert now[: CONFIG.elites].tobytes() == before[best].tobytes()
+        assert np.asarray(search.leader()).tobytes() == now[0].tobytes()
+        search.tell(first_gene(now))
+        before = now
+
+
+def test_elites_are_the_best_of_their_groups():
+    """A group that met easier episodes has no more of them."""
+    search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=3, elites=8), seed=1)
+    asked = search.ask()
+    members = search.genomes(EVERYONE)
+    scores = first_gene(members) + 100.0 * np.repeat(np.arange(4), 10)
+    search.tell(scores)
+    best = np.argsort(-ranks(scores, asked.groups), kind="stable")[:8]
+    assert sorted(best // 10) == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert search.parents[:8].tobytes() == members[best].tobytes()
+
+
+def test_both_parents_come_from_the_pool_and_mutation_is_as_asked_for():
+    config = SearchConfig(population=4000, groups=1, tournament=2, elites=3, sigma=0.7, mutation_rate=0.2)
+    search = TwoParents(SPEC, config, seed=5)
+    told(search, first_gene)
+    assert len(search.parents) == PARENTS + 3
+    asked = search.ask()
+    assert asked.mutation == Mutation(rate=0.2, sigma=0.7)
+    children = asked.recipes[3:]
+    for side in ("a", "b"):
+        assert set(children[side].tolist()) == set(range(3, PARENTS + 3))
+    assert (children["a"] != children["b"]).mean() == pytest.approx(1.0 - 1.0 / PARENTS, abs=0.01)
+    assert len(set(children["seed"].tolist())) == len(children)
+
+
+@pytest.mark.parametrize("elites", [0, 4])
+def test_a_search_that_starts_from_a_genome_breeds_from_it(elites):
+    search = TwoParents(SPEC, SearchConfig(population=40, elites=elites, mutation_rate=0.0), seed=1)
+    genome = new_genomes(SPEC)[0]
+    search.start_from(genome)
+    search.ask()
+    assert (search.genomes(EVERYONE) == genome).all()
+
+
+# --- Breeding --------------------------------------------------------------------------------------------------------
+
+
+MLP, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")
+FREE = symmetry(MLP).free  # genes with noise of their own
+STILL = Mutation(rate=0.0, sigma=0.0)
+
+
+def many(kind, a, b, n):
+    made = np.zeros(n, dtype=RECIPE)
+    made["kind"], made["a"], made["b"], made["seed"] = kind, a, b, np.arange(n)
+    return made
+
+
+@pytest.fixture(scope="module")
+def parents():
+    return np.random.default_rng(0).normal(size=(5, MLP.size)).astype(F)
+
+
+def is_normal(noise):
+    """Whether numbers may be of N(0, 1), by Kolmogorov and Smirnov; one of 4,096 levels is as near as they come."""
+    return stats.kstest(np.ravel(noise), "norm").statistic < 1.95 / np.sqrt(np.size(noise)) + 1.0 / len(QUANTILES)
+
+
+def test_a_copy_is_bit_identical(parents):
+    odd = parents.copy()
+    odd[2, :4] = [-0.0, np.inf, 1e-42, -np.inf]
+    odd[2, 4] = np.array([0x7FC12345], dtype=np.uint32).view(F)[0]  # a not-a-number of its own
+    children = breed(odd, np.array([(0, 2, 1, 0), (0, 0, 2, 9)], dtype=RECIPE), 9, MLP, Mutation(rate=1.0))
+    assert children.tobytes() == odd[[2, 0]].tobytes()
+
+
+@pytest.mark.parametrize("spec", [MLP, CNN, PolicySpec.parse("mlp:3+motion")], ids=str)
+def test_new_genomes_are_normal_and_as_large_as_genes_are(spec):
+    n = 600
+    noise = new_genomes(spec, n, seed=1) / gene_scales(spec).astype(float)
+    for part in np.array_split(np.arange(spec.size), 8):
+        assert noise[:, part].mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(n * len(part)))
+        assert noise[:, part].std() == pytest.approx(1.0, abs=4.0 / np.sqrt(n * len(part)))
+    assert is_normal(noise[:, :: max(spec.size // 100, 1)])
+
+
+def test_neighbouring_genes_seeds_and_keys_have_noise_of_their_own():
+    noise, other = (new_genomes(MLP, 2000, key)[:, FREE].astype(float) for key in (3, 4))
+    for gap in range(1, 9):  # four numbers are drawn at a time
+        assert abs((noise[:, gap:] * noise[:, :-gap]).mean()) < 5.0 / np.sqrt(noise.size)
+    assert abs((noise[1:] * noise[:-1]).mean()) < 5.0 / np.sqrt(noise.size)
+    assert abs((noise * other).mean()) < 5.0 / np.sqrt(noise.size)
+
+
+@pytest.mark.parametrize("spec", [MLP, PolicySpec.parse("mlp:4"), CNN], ids=str)  # blocks of four numbers, and not
+def test_a_step_is_the_centre_and_its_seed_s_noise_at_the_scale_of_each_gene(spec):
+    rng = np.random.default_rng(4)
+    centre, made, weights = rng.normal(size=(1, spec.size)).astype(F), many(Kind.STEP, 0, 0, 30), rng.normal(size=30)
+    made["seed"] = rng.integers(1 << 32, size=30)
+    weights[[3, 5]] = 0.0
+    z = breed(np.zeros_like(centre), made, 99, spec, Mutation(sigma=1.0)).astype(float)
+    assert is_normal((z / gene_scales(spec))[:, symmetry(spec).free])
+    np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre + 0.25 * z, atol=1e-6)
+    np.testing.assert_allclose(noise_sum(made["seed"], weights, 99, spec), weights @ z, atol=3e-5)
+    made["kind"] = Kind.MIRRORED
+    np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre - 0.25 * z, atol=1e-6)
+
+
+def test_a_child_of_two_has_each_gene_of_one_of_both(parents):
+    children = breed(parents, many(Kind.CROSS, 1, 4, 2000), 77, MLP, STILL)
+    from_a, from_b = children == parents[1], children == parents[4]
+    assert (from_a ^ from_b).all()
+    assert abs(from_b.mean() - 0.5) < 4 * 0.5 / np.sqrt(from_b.size)
+    # Every gene and every child has about half of each; neighbouring genes are inherited independently.
+    assert np.abs(from_b.mean(axis=0) - 0.5).max() < 5 * 0.5 / np.sqrt(2000)
+    assert np.abs(from_b.mean(axis=1) - 0.5).max() < 5 * 0.5 / np.sqrt(MLP.size)
+    assert abs((from_b[:, 1:] == from_b[:, :-1]).mean() - 0.5) < 4 * 0.5 / np.sqrt(from_b.size)
+
+
+@pytest.mark.parametrize(("rate", "sigma"), [(0.03, 0.5), (0.2, 2.0), (1.0, 1.0)])
+def test_mutation_is_gaussian_at_its_rate(rate, sigma):
+    zero = np.zeros((1, MLP.size), dtype=F)
+    children = breed(zero, many(Kind.CROSS, 0, 0, 2000), 4, MLP, Mutation(rate=rate, sigma=sigma))
+    changed = children != 0.0
+    assert abs(changed.mean() - rate) < 4 * np.sqrt(rate * (1 - rate) / changed.size) + 1e-6
+    assert np.abs(changed.mean(axis=0) - rate).max() < 5 * np.sqrt(rate * (1 - rate) / 2000) + 1e-6
+    assert is_normal(children[changed][:20_000].astype(float) / sigma)
+
+
+@settings(max_examples=30, derandomize=True)
+@given(data=st.data())
+def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data):
+    made = np.concatenate([
+        many(Kind.CROSS, 1, 2, 12), many(Kind.NEW, 0, 0, 4), many(Kind.STEP, 3, 0, 5), many(Kind.MIRRORED, 3, 0, 5),
+        many(Kind.COPY, 0, 0, 2),
+    ])  # fmt: skip
+    key = data.draw(st.integers(0, 2**63 - 1))
+    whole = breed(parents, made, key, MLP, Mutation(rate=0.1))
+    chosen = data.draw(st.lists(st.integers(0, len(made) - 1), min_size=1, max_size=20))
+    assert breed(parents, made[chosen], key, MLP, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()

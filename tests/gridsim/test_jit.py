@@ -59,31 +59,23 @@ def small(tmp_path):
     return run
 
 
-@pytest.fixture
-def copy(root, tmp_path):
-    """A copy of the packages that hold kernels, to be edited."""
-    folder = tmp_path / "copy"
+def test_an_edited_kernel_is_compiled_anew_and_a_copy_elsewhere_is_not(root, tmp_path):
+    copy, without = tmp_path / "copy", shutil.ignore_patterns("__pycache__", "*.nb?")
     for package in jit.KERNEL_PACKAGES:
-        shutil.copytree(root / package, folder / package, ignore=shutil.ignore_patterns("__pycache__", "*.nb?"))
-    return folder
+        shutil.copytree(root / package, copy / package, ignore=without)
+    cache, said = tmp_path / "cache", {"PYTHONDONTWRITEBYTECODE": "1", "GRIDSIM_CACHE_DIR": str(tmp_path / "cache")}
 
+    def call(folder):
+        return json.loads(finish("python", "-c", CALLER, cwd=folder, **said).stdout)
 
-def python(code, folder, cache):
-    """Run a script in a process of its own; its last line is JSON."""
-    done = finish("python", "-c", code, cwd=folder, GRIDSIM_CACHE_DIR=str(cache), PYTHONDONTWRITEBYTECODE="1")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_an_edited_kernel_is_compiled_anew_and_a_copy_elsewhere_is_not(copy, tmp_path):
-    cache = tmp_path / "cache"
-    first = python(CALLER, copy, cache)
+    first = call(copy)
     assert Path(first["file"]).is_relative_to(copy)
     assert Path(first["folder"]).is_relative_to(cache)
     assert (first["hit"], first["from_cache"]) == (False, 0)
 
     elsewhere = tmp_path / "shipped" / "unpacked"
     shutil.copytree(copy, elsewhere)
-    again = python(CALLER, elsewhere, cache)
+    again = call(elsewhere)
     assert Path(again["file"]).is_relative_to(elsewhere)
     assert again["folder"] == first["folder"]
     assert (again["hit"], again["from_cache"]) == (False, 1)
@@ -92,7 +84,7 @@ def test_an_edited_kernel_is_compiled_anew_and_a_copy_elsewhere_is_not(copy, tmp
     text, edits = re.subn(r"(?m)^FIELD_FLOOR = -2\.0\b", "FIELD_FLOOR = -9.0", roads.read_text())
     assert edits == 1
     roads.write_text(text)
-    edited = python(CALLER, copy, cache)
+    edited = call(copy)
     assert edited["folder"] != first["folder"]
     assert (edited["hit"], edited["from_cache"]) == (True, 0)
 
@@ -121,39 +113,25 @@ def test_the_cache_folder_is_the_users_choice_or_temporary(places, tmp_path, mon
     assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o700
     (tmp_path / "file").touch()  # nothing can be written below it
     monkeypatch.setenv("GRIDSIM_CACHE_DIR", str(tmp_path / "file"))
-    with pytest.warns(
-        UserWarning, match=rf"^[^\n]*{tmp_path}/file: it is a link or a file[^\n]*GRIDSIM_CACHE_DIR[^\n]*$"
-    ):
+    said = rf"^[^\n]*{tmp_path}/file: it is a link or a file[^\n]*GRIDSIM_CACHE_DIR[^\n]*$"
+    with pytest.warns(UserWarning, match=said):
         assert cache_folder("k") == temporary / "k"
     assert cache_folder("k") == temporary / "k"  # of a child process, without another warning
 
 
-def _no_home(users, monkeypatch):
-    """As for a user id that no list of users has, without HOME."""
-    monkeypatch.delenv("HOME")
-    monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
-
-
-def _others_can_write(users, monkeypatch):
-    (users / "k").mkdir(parents=True)
-    (users / "k").chmod(0o777)
-
-
-def _others_can_replace(users, monkeypatch):
-    (users / "k").mkdir(parents=True)
-    users.chmod(0o777)
-
-
-def _a_link(users, monkeypatch):
-    (users.parent / "other").mkdir(parents=True)
-    users.mkdir()
-    (users / "k").symlink_to(users.parent / "other")
-
-
-@pytest.mark.parametrize("fault", [_no_home, _others_can_write, _others_can_replace, _a_link])
+@pytest.mark.parametrize("fault", ["no home", "a link", "others can write", "others can replace"])
 def test_a_folder_that_others_can_change_or_that_cannot_be_made_is_not_used(fault, places, monkeypatch):
     users, temporary = places
-    fault(users, monkeypatch)
+    if fault == "no home":  # as for a user id that no list of users has
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr("pwd.getpwuid", lambda user: {}[user])
+    elif fault == "a link":
+        for folder in (users, users.parent / "other"):
+            folder.mkdir(parents=True)
+        (users / "k").symlink_to(users.parent / "other")
+    else:
+        (users / "k").mkdir(parents=True)
+        (users / "k" if fault == "others can write" else users).chmod(0o777)
     assert cache_folder("k") == temporary / "k"
     assert not [*users.glob("k/*")]
 

@@ -1,33 +1,39 @@
-"""Maps from files: against closed forms, and as scenarios like others."""
+"""Maps from files: against closed forms, as scenarios like others, and refused in one line whatever they hold."""
 
+import contextlib
 import math
 import os
 import pickle
 import re
+import struct
 import warnings
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import finish
+import yaml
+from commands import CHAMPION, finish
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pictures import PPM, H, W, crashes, distance, picture, read, save, strip, write_yaml
 from PIL import Image
 
 from cluster.commands.cli import _prepare
-from cluster.settings import EvolveSettings
+from cluster.settings import EvolveSettings, from_dict
 from cluster.store.champion import Champion, evaluate
 from cluster.store.folder import RunError, new_run, open_run, read_config
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv
-from gridsim.maps.files import MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
+from gridsim.errors import GridSimError
+from gridsim.maps.files import MAX_PIXELS, MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
 from gridsim.maps.map import starts_at
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import build, label
 from gridsim.simulator import Simulator
 
 pytestmark = pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")  # most are small, or all road
-CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 
 
 @pytest.fixture(scope="module")
@@ -177,16 +183,12 @@ def test_thresholds_negate_and_the_unknown(tmp_path):
     assert levels[read_free(picture_alone)[0]].tolist() == [205, 206, 254, 255]
 
 
-@pytest.mark.parametrize(
-    ("suffix", "mode"),
-    [
-        *((suffix, "L") for suffix in ("png", "pgm", "jpg", "bmp")),
-        *(("png", mode) for mode in ("LA", "RGBA", "P", "1", "I;16")),
-        ("pgm", "I;16"),
-    ],
-)
-def test_formats(tmp_path, suffix, mode):
-    pixels = np.zeros((40, 60), dtype=np.uint8)
+FORMATS = "png:L pgm:L jpg:L bmp:L png:LA png:RGBA png:P png:1 png:I;16 pgm:I;16"
+
+
+@pytest.mark.parametrize("form", FORMATS.split())
+def test_formats(tmp_path, form):
+    (suffix, mode), pixels = form.split(":"), np.zeros((40, 60), dtype=np.uint8)
     pixels[8:24, 16:40] = 255
     deep = Image.fromarray(pixels.astype(np.uint16) * 257)
     image = deep if mode == "I;16" else Image.fromarray(pixels).convert(mode)
@@ -196,8 +198,7 @@ def test_formats(tmp_path, suffix, mode):
 
 @pytest.mark.parametrize("mode", ["LA", "RGBA", "P"])
 def test_transparent_is_wall(tmp_path, mode):
-    alpha = np.repeat([0, 255], [12, 12]).astype(np.uint8).reshape(4, 6)
-    image = Image.fromarray(alpha)
+    image = Image.fromarray(np.repeat([0, 255], [12, 12]).astype(np.uint8).reshape(4, 6))
     if mode == "P":  # both of its colours are white
         image.putpalette([255] * 768)
         image.save(tmp_path / "a.png", transparency=0)
@@ -208,7 +209,6 @@ def test_transparent_is_wall(tmp_path, mode):
 
 
 def test_tiles_do_not_show():
-    """A picture cut up gives what it gives whole."""
     free = np.random.default_rng(3).random((40, 1300)) < 0.97  # 0.25 m: 325 m, three tiles
     free = free.repeat(4, axis=0)
     nodes = signed_clearance(free, 0.25, 1024, 128)
@@ -227,8 +227,7 @@ def test_one_map_for_all_seeds(track):
     assert (len(track.network.steps), track.mileage.tolist()) == (0, [0.0])
     assert 100 < len(track.starts) <= 512
     assert not track.starts.flags.writeable
-    edges = starts_at(track, np.array([0.0, np.nextafter(1.0, 0.0)]))
-    np.testing.assert_array_equal(edges, track.starts[[0, -1]])
+    np.testing.assert_array_equal(starts_at(track, np.array([0.0, np.nextafter(1.0, 0.0)])), track.starts[[0, -1]])
     assert not pickle.loads(pickle.dumps(track)).torus
 
 
@@ -256,29 +255,154 @@ def test_environments_and_champions_drive_on_it(track):
 
 
 def test_traffic_that_a_map_cannot_have_changes_nothing(track, capsys):
-    asked, plain = (
-        _prepare("gridsim-evolve", ["--scenario", track.name, "--traffic", n])[1].settings for n in ("3", "0")
-    )
+    road = ["--scenario", track.name, "--traffic"]
+    asked, plain = (_prepare("gridsim-evolve", [*road, number])[1].settings for number in "30")
     assert asked == plain
     assert capsys.readouterr().err == f"gridsim-evolve: {track.name} has no lanes for traffic; running without\n"
 
 
-def test_runs_know_their_map_again(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_runs_know_their_map_again(here, monkeypatch):
     pixels = picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0)
-    save(tmp_path / "a b.png", pixels)
-    run = new_run(tmp_path / "runs", "", EvolveSettings(scenario="a b.png"))
-    assert run.settings.scenario == str(tmp_path / "a b.png")
+    save(here / "a b.png", pixels)
+    run = new_run(here / "runs", "", EvolveSettings(scenario="a b.png"))
+    assert run.settings.scenario == str(here / "a b.png")
     assert run.name.startswith("a_b-evolution-s0-")
     run.path.mkdir(parents=True)
     run.write_config()
     monkeypatch.chdir("/")
     assert read_config(run.path / "config.json")[0] == run.settings
-    save(tmp_path / "a b.png", pixels[::-1, 20:])
+    save(here / "a b.png", pixels[::-1, 20:])
     with pytest.raises(RunError, match="is not what it was"):
         read_config(run.path / "config.json")
     with pytest.raises(RunError, match="is not what it was"):
         open_run(run.path)
-    (tmp_path / "a b.png").unlink()
+    (here / "a b.png").unlink()
     with pytest.raises(RunError, match="No such file"):
         open_run(run.path)
+
+
+# --- What is refused -------------------------------------------------------------------------------------------------
+
+
+def refused(name):
+    with pytest.raises(GridSimError, match=r"^[^\n]{1,600}$") as caught:
+        load_map(str(name))
+    with pytest.raises(GridSimError):
+        from_dict(EvolveSettings, {"scenario": str(name)})
+    return str(caught.value)
+
+
+def test_a_bomb_is_not_decoded(tmp_path):
+    """A PNG of a few bytes that would be very large: its header, of the bytes 12 to 33, says so."""
+    path = tmp_path / "bomb.png"
+    png = bytearray(Path(save(path, np.zeros((9, 9), np.uint8))).read_bytes())
+    png[16:24] = struct.pack(">II", 10_000, 7_000)
+    png[29:33] = struct.pack(">I", zlib.crc32(png[12:29]))
+    path.write_bytes(png)
+    assert f"{MAX_PIXELS:,}" in refused(path)
+
+
+def test_pictures_that_are_no_maps(tmp_path):
+    whole = Path(save(tmp_path / "whole.png", picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0))).read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "empty.png").write_bytes(b"")
+    (tmp_path / "folder.png").mkdir()
+    assert "truncated" in refused(tmp_path / "cut.png")
+    assert "not a readable picture" in refused(tmp_path / "empty.png")
+    assert "Is a directory" in refused(tmp_path / "folder.png")
+    assert "No such file" in refused(tmp_path / "missing.png")
+    assert "not a valid path" in refused("nul\0l.png")
+    assert "picture" in refused(tmp_path / "map.tiff")
+    assert "all road" in refused(save(tmp_path / "road.png", np.full((99, 99), 255, np.uint8)))
+    (tmp_path / "real.pgm").write_bytes(b"Pf\n99 99\n-1.0\n" + np.ones((99, 99), np.float32).tobytes())
+    assert "8 or 16 bits" in refused(tmp_path / "real.pgm")
+    assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
+    assert "no room" in refused(save(tmp_path / "path.png", picture(strip(50, 20, 0.0, 1.0), 100.0, 40.0)))
+    assert "no room" in refused(save(tmp_path / "yard.png", picture(strip(50, 20, 0.0, 5.0, 6.0), 100.0, 40.0)))
+
+
+# A YAML, and what the line says.
+WRONG = {
+    "[1, 2]": "mapping",
+    "[" * 2000: "not valid YAML",
+    "!!python/object/apply:os.system ['true']": "not valid YAML",
+    "resolution: 0.1": "image",
+    "image: map.png": "resolution",
+    "{image: map.png, resolution: .nan}": "not nan",
+    "{image: map.png, resolution: 1e9}": "from 0.01 to 1",
+    "{image: map.png, resolution: 1}": "is too large",
+    "{resolution: 0.1, image: [map.png]}": "image must name",
+    "{resolution: 0.1, image: /map.png}": "own folder",
+    "{resolution: 0.1, image: link.png}": "own folder",
+    "{resolution: 0.1, image: loop.png}": "loop.png",
+    "{resolution: 0.1, image: none.png}": "No such file",
+    "{image: map.png, resolution: 0.1, start: []}": "unknown key 'start'",
+    "{image: map.png, resolution: 0.1, free_thresh: 0.7}": "not above occupied_thresh",
+    "{image: map.png, resolution: 0.1, negate: 2}": "negate",
+    "{image: map.png, resolution: 0.1, mode: raw}": "mode must be trinary or scale",
+    "{image: map.png, resolution: 0.1, origin: [0, 0, 0.5]}": "yaw",
+    "{image: map.png, resolution: 0.1, speed: [9, 3]}": "speed",
+    "{image: map.png, resolution: 0.1, starts: {x: 1}}": "starts",
+    "{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}": "heading",
+}
+
+
+@pytest.fixture(scope="module")
+def wrong_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("outer") / "inner"
+    folder.mkdir()
+    pixels = np.zeros((3000, 3000), dtype=np.uint8)
+    pixels[5:-5, 5:-5] = 255
+    save(folder / "map.png", pixels)
+    save(folder.parent / "map.png", pixels[:50])
+    (folder / "link.png").symlink_to("../map.png")
+    (folder / "loop.png").symlink_to("loop.png")
+    return folder
+
+
+@pytest.mark.parametrize(("text", "expected"), WRONG.items(), ids=range(len(WRONG)))
+def test_wrong_yaml_is_one_clear_line(wrong_folder, text, expected):
+    path = wrong_folder / "map.yaml"
+    path.write_text(text)
+    assert expected in refused(path)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A folder and the bytes of a small, good picture."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    return folder, Path(save(folder / "good.png", picture(strip(20, 8, 0.0, 4.0, 18.0), 40.0, 16.0, 4))).read_bytes()
+
+
+def loads_or_is_refused(path):
+    with contextlib.suppress(GridSimError):
+        scenario = load_map(str(path))
+        assert len(scenario.starts)
+        assert not crashes(scenario.road, scenario.starts).any()
+
+
+scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.dates() | st.binary()
+values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
+GOOD = {
+    "image": "good.png", "resolution": 0.25, "origin": [0, 0, 0], "negate": 0, "free_thresh": 0.5,
+    "occupied_thresh": 0.65, "mode": "scale", "starts": [[20, 8, 0]], "speed": [5, 12],
+}  # fmt: skip
+
+
+@settings(max_examples=40)
+@given(changes=st.dictionaries(st.sampled_from([*GOOD, "other"]), values, max_size=3), drop=st.booleans())
+def test_any_values(small, changes, drop):
+    path = small[0] / "values.yaml"
+    keys = {k: v for k, v in GOOD.items() if not (drop and k in ("resolution", "starts"))}
+    path.write_text(yaml.safe_dump({**keys, **changes}))
+    loads_or_is_refused(path)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 32), st.sampled_from([1, 4, 10]))
+def test_any_pixels(small, seed, share, grain, ppm):
+    coarse = (np.random.default_rng(seed).random((64 // grain + 1,) * 2) < share).astype(np.uint8) * 255
+    save(small[0] / "blobs.png", coarse.repeat(grain, axis=0).repeat(grain, axis=1)[:64, :64])
+    path = small[0] / "blobs.yaml"
+    path.write_text(f"{{image: blobs.png, resolution: {1 / ppm}}}")
+    loads_or_is_refused(path)

@@ -34,7 +34,6 @@ def car_at(x, y, heading=0.0):
 
 
 def distance(pixels, colour):
-    """How far pixels [..., 3] are from a colour."""
     return np.abs(pixels.astype(int) - np.array(colour)).max(axis=-1)
 
 
@@ -55,8 +54,7 @@ def test_every_pixel_is_road_where_the_map_has_road(scenario):
         clear = read(scenario.road, np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
         wall = clear < -paint.VERGE_WIDTH - 0.3
         assert wall.sum() > 10_000
-        ground = np.minimum(distance(image, paint.GROUND), distance(image, paint.GROUND_OTHER))
-        assert ground[wall].max() <= 1
+        assert np.minimum(distance(image, paint.GROUND), distance(image, paint.GROUND_OTHER))[wall].max() <= 1
         # Well inside, there is asphalt but for the car and the marks.
         inside = clear > 0.8
         off = distance(image, paint.ASPHALT) > 1
@@ -91,8 +89,7 @@ def test_car_covers_its_own_outline(scenario, state):
 
 def test_other_cars_are_where_the_boxes_are_also_over_the_seam(scenario):
     renderer = Renderer(scenario, (320, 240))
-    width = float(scenario.road.width)
-    car = car_at(width - 2.0, 128.0)
+    car = car_at(float(scenario.road.width) - 2.0, 128.0)
     box = np.array([[8.0, 130.0, 1.0, 0.0]])  # 10 m ahead, beyond the edge of the torus, and 2 m to the left
     blue = distance(renderer.draw(car, boxes=box), paint.OTHER) < 25
     blue &= ~(distance(renderer.draw(car), paint.OTHER) < 25)
@@ -123,5 +120,4 @@ def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     flat = dataclasses.replace(scenario, torus=False)
     image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map
     ahead = image[: int(240 * render.CAR_AT) - 25]
-    ground = np.minimum(distance(ahead, paint.GROUND), distance(ahead, paint.GROUND_OTHER))
-    assert ground.max() <= 1
+    assert np.minimum(distance(ahead, paint.GROUND), distance(ahead, paint.GROUND_OTHER)).max() <= 1

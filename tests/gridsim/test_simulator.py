@@ -1,4 +1,4 @@
-"""The order of events: cars against the oracle through whole episodes, and what must not earn distance."""
+"""The car's motion, the order of events and whole episodes against the oracle, and what must not earn distance."""
 
 import math
 from types import SimpleNamespace
@@ -6,18 +6,110 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pictures import crashes, small_map
+from scipy.integrate import solve_ivp
 
-from gridsim.car.vehicle import Action
-from gridsim.config import EpisodeConfig, SimConfig
+from gridsim.car.vehicle import Action, act, act_continuous, advance, path_curvature
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
 from gridsim.state import COS, DISTANCE, IDLE, LANE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.traffic.world import spawn
 
-F = np.float32
 CONFIG = SimConfig()
+K = constants(CONFIG)
+F = np.float32
+DT = 0.1  # s
+STILL = 1e-6  # m/s, rounding: what stands still may seem to move by as much
+
+speeds = st.floats(-3.0, 30.0, width=32)
+steerings = st.floats(-27.0, 27.0).map(math.radians).map(F)
+actions = st.sampled_from(list(Action))
+
+
+def moved(car, acceleration, kappa, k=K):
+    """A car (x, y, cosine, sine, speed) after a control period."""
+    return tuple(map(F, advance(k, *car, F(acceleration), kappa, k.dt)[:5]))
+
+
+@pytest.mark.parametrize("pedal", [-1.0, -0.3])
+@pytest.mark.parametrize("speed", [12.3, 0.5, -2.0])
+def test_the_pedal_brakes_to_a_stand_and_not_further(pedal, speed):
+    car = F(0.0), F(0.0), F(1.0), F(0.0), F(speed)
+    for _ in range(60):
+        acceleration, _ = act_continuous(K, F(pedal), F(0.0), car[4], F(0.0))
+        assert abs(acceleration) <= -8.0 * pedal * (1 + 1e-6)
+        car = moved(car, acceleration, F(0.0))
+    assert abs(car[4]) <= STILL
+    assert car[0] * speed > 0.0
+
+
+def test_braking_in_a_bend_stays_within_the_friction_circle():
+    """Of 1 g, whatever an action asks for at any speed; CommonRoad's cars may have 11.5 m/s2."""
+    assert float(act(K, Action.BRAKE, F(30.0), F(0.0))[0]) == -8.0
+    for speed in np.linspace(0.0, 30.0, 61):
+        lateral = speed**2 * float(path_curvature(K, F(speed), K.steering_limit))
+        assert max(math.hypot(lateral, float(act(K, a, F(speed), F(0.0))[0])) for a in Action) < 9.81
+
+
+def kong(_t: float, state: np.ndarray, steering: float, acceleration: float) -> list[float]:
+    """Kong et al. 2015, equations 1: derivatives of x, y, psi, v."""
+    _, _, psi, v = state
+    beta = math.atan(1.25 / 2.5 * math.tan(steering))
+    return [v * math.cos(psi + beta), v * math.sin(psi + beta), v / 1.25 * math.sin(beta), acceleration]
+
+
+def test_ten_seconds_of_stepwise_steering_are_kongs():
+    """A command acts at the beginning of its period: Kong's equations under the same steps, without a grip limit."""
+    rng, state, steering = np.random.default_rng(0), [0.0, 0.0, 0.0, 8.0], F(0.0)
+    car, k = (F(0.0), F(0.0), F(1.0), F(0.0), F(8.0)), constants(SimConfig(VehicleConfig(lateral_grip=math.inf)))
+    for action in rng.choice([Action.LEFT, Action.RIGHT, Action.NONE], 100):
+        steering = F(act(k, int(action), car[4], steering)[1])
+        car = moved(car, 0.0, path_curvature(k, car[4], steering), k)
+        state = list(solve_ivp(kong, (0.0, DT), state, args=(float(steering), 0.0), rtol=1e-9, atol=1e-9).y[:, -1])
+    assert math.hypot(car[0] - state[0], car[1] - state[1]) < 1e-3
+
+
+@given(speed=speeds, steering=steerings, heading=st.floats(-math.pi, math.pi), action=actions)
+def test_a_period_is_the_oracles(speed, steering, heading, action):
+    acceleration, angle = act(K, int(action), F(speed), steering)
+    expected = oracle.act(CONFIG, int(action), float(speed), float(steering))
+    assert (float(acceleration), float(angle)) == pytest.approx(expected, abs=2e-6, rel=1e-6)
+    kappa = path_curvature(K, F(speed), F(angle))
+    start = (F(3.0), F(-2.0), F(math.cos(heading)), F(math.sin(heading)), F(speed))
+    x, y, cosine, sine, after, length = advance(K, *start, F(acceleration), kappa, K.dt)
+    looks = oracle.advance(CONFIG, (3.0, -2.0, heading), float(speed), float(angle), float(acceleration))
+    # A speed limit reached within the period: the kernel's mean speed is that of its ends, the oracle's is exact.
+    clipped = not -3.0 <= float(speed) + float(acceleration) * DT <= 30.0
+    tolerance = 6e-3 if clipped else 1e-5
+    assert float(length) == pytest.approx(looks[-1, 4], abs=tolerance)
+    assert (float(x), float(y)) == pytest.approx((looks[-1, 0], looks[-1, 1]), abs=tolerance)
+    assert float(after) == pytest.approx(looks[-1, 3], abs=1e-5)
+    assert abs(math.remainder(math.atan2(sine, cosine) - looks[-1, 2], 2 * math.pi)) < tolerance
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SimConfig(vehicle=VehicleConfig(width=-1.0)),
+        SimConfig(vehicle=VehicleConfig(wheelbase=math.nan)),
+        SimConfig(vehicle=VehicleConfig(rear_axle=2.5)),
+        SimConfig(sensors=SensorConfig(rays=1)),
+        SimConfig(sensors=SensorConfig(field_of_view=361.0)),
+        SimConfig(episode=EpisodeConfig(control_period=0.0)),
+        SimConfig(vehicle=VehicleConfig(length=12.5)),  # longer than the gaps at the start of an episode
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused_in_one_line(config):
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        constants(config)
+
+
+# --- Episodes --------------------------------------------------------------------------------------------------------
+
 SIDE = 256.0
 INTERVAL = (5.0, 12.0)  # m/s
 TARGET, MAX_STEPS = 150.0, 200  # of the episodes that are driven at random and by sight
@@ -170,8 +262,7 @@ def straight():
 @pytest.mark.parametrize("side", [1, -1])
 def test_circling_on_the_spot_earns_one_round(plain, speed, radius, side):
     """As the wheels are turned when it is slow, and of v^2 / 4.9 when it is faster."""
-    start = [64, 64, 0.3, speed, side * math.radians(27.0)]
-    r = run(plain, start, always(Action.LEFT if side > 0 else Action.RIGHT))
+    r = run(plain, [64, 64, 0.3, speed, side * math.radians(27.0)], always(Action.LEFT if side > 0 else Action.RIGHT))
     rnd = 2 * math.pi * radius
     assert rnd < 200.0
     assert r.end == "IDLE"
@@ -207,8 +298,7 @@ def test_back_and_forth_earns_the_furthest_point(straight):
 @pytest.mark.parametrize("heading", [0.0, 0.02, math.pi])
 def test_nothing_tunnels_through_a_thin_wall(wall, heading):
     """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
-    lines = [[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]]
-    road_map = small_map(lines, width=128.0, height=128.0)
+    road_map = small_map([[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]], width=128.0, height=128.0)
     first, edge, way = (40.0, 80.0, 1) if heading < 1.0 else (120.0, 80.0 + wall, -1)
     for k in range(32):
         r = run(road_map, [first + 0.1 * k * way, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pictures import cars_on, crashes, straight_road
 from scipy import stats
 
+from gridsim import state
 from gridsim.car.collision import boxes_touch, hits_box
 from gridsim.car.vehicle import path_curvature
 from gridsim.config import SimConfig, VehicleConfig, constants
@@ -19,21 +20,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.state import (
-    ALONG,
-    COS,
-    LANE,
-    LANE_TIMER,
-    NEXT,
-    PERMIT,
-    SECOND_NEXT,
-    SIN,
-    SPEED,
-    SPEED_FACTOR,
-    STEERING,
-    X,
-    Y,
-)
+from gridsim.state import ALONG, COS, LANE, LANE_TIMER, PERMIT, SIN, SPEED, SPEED_FACTOR, STEERING, X, Y
 from gridsim.traffic.behaviour import drivers, idm, step_traffic
 from gridsim.traffic.world import spawn
 
@@ -175,8 +162,7 @@ def test_behind_a_standing_car_a_queue_forms_without_touching(ring, speed):
     x = history[:, :, ALONG]
     assert (x < 500.0 - LENGTH).all()
     assert (history[-1, :, SPEED] < 0.02).all()
-    between = x[-1, :-1] - x[-1, 1:] - LENGTH
-    assert between == pytest.approx(CONFIG.traffic.jam, abs=0.3)
+    assert x[-1, :-1] - x[-1, 1:] - LENGTH == pytest.approx(CONFIG.traffic.jam, abs=0.3)
     assert 2.0 - 0.3 < 500.0 - x[-1, 0] - LENGTH < 5.0
     deceleration = -np.diff(history[:, :, SPEED], axis=0) / DT
     assert deceleration.max() <= CONFIG.traffic.braking + 1e-3
@@ -207,8 +193,7 @@ def test_lanes_are_as_fast_as_their_bends_allow(heading, radius):
         at = [(heading + k * math.copysign(math.pi / 2, radius)) for k in range(4)]
         paths = [Path(100.0 + radius * math.sin(h), 100.0 - radius * math.cos(h), h, (piece,)) for h in at]
     network = network_of(paths, 256.0, 256.0)
-    fastest = min(12.0, math.sqrt(CONFIG.traffic.lateral * abs(radius)))
-    assert network.speeds == pytest.approx(fastest, rel=2e-3)
+    assert network.speeds == pytest.approx(min(12.0, math.sqrt(CONFIG.traffic.lateral * abs(radius))), rel=2e-3)
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +311,7 @@ def test_the_second_of_a_queue_has_no_permit_before_the_first():
     south = Path(128.0, 120.0, -math.pi / 2, ((256.0, 0.0),))  # lane 7, round the torus into itself
     network = network_of([*crossing_paths(), turn, south], 256.0, 256.0)
     world = cars_on(network, (0, 116.0, 0.0, 1.0), (0, 110.0, 0.0, 1.0))
-    world[1, [NEXT, SECOND_NEXT]] = 6, 7
+    world[1, [state.NEXT, state.SECOND_NEXT]] = 6, 7
     assert {6} < set(network.successors[0])
     stuck = watch(network, world, 20, ego(134.0, 128.0))
     assert (stuck[:, :, PERMIT] == -1.0).all()
@@ -334,8 +319,7 @@ def test_the_second_of_a_queue_has_no_permit_before_the_first():
     after = watch(network, stuck[-1], 20)
     assert 1 in after[:, 0, LANE]
     assert 6 in after[:, 1, LANE]
-    free = watch(network, world[1:], 20, ego(134.0, 128.0))
-    assert 6 in free[:, 0, LANE]  # alone it does not wait
+    assert 6 in watch(network, world[1:], 20, ego(134.0, 128.0))[:, 0, LANE]  # alone it does not wait
 
 
 def test_a_fast_car_passes_a_slow_one(abreast):

@@ -15,12 +15,8 @@ needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
 
 
 class Browser:
-    """A browser with one open page, driven by the DevTools protocol over a pipe.
-
-    Attributes:
-        faults: what went wrong on the page: exceptions, console errors, what its policy blocked.
-        requests: addresses that the page asked for.
-    """
+    """A browser with one open page, driven by the DevTools protocol over a pipe. `faults` are its exceptions, console
+    errors and what its policy blocked, `requests` the addresses that it asked for."""
 
     def __init__(self, address, profile):
         to_browser, self._out = os.pipe()
@@ -48,18 +44,15 @@ class Browser:
         os.close(self._in)
 
     def run(self, script):
-        """The value of a script on the page."""
         return self._call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
     def wait_for(self, script, seconds=30.0):
-        """Wait until a script's value is true."""
         ends = time.monotonic() + seconds
         while not self.run(script):
             assert time.monotonic() < ends, (script, self.faults)
             time.sleep(0.1)
 
     def wait_for_text(self, text, seconds=60.0):
-        """Wait until the page holds a text, as HTML."""
         self.wait_for(f"document.documentElement.outerHTML.includes({json.dumps(text)})", seconds)
 
     def _call(self, method, **parameters):
@@ -81,7 +74,5 @@ class Browser:
     def _note(self, method, parameters):
         if method == "Network.requestWillBeSent":
             self.requests.append(parameters["request"]["url"])
-        elif method == "Runtime.exceptionThrown" or (
-            method == "Log.entryAdded" and parameters["entry"]["level"] == "error"
-        ):
+        elif method == "Runtime.exceptionThrown" or (parameters or {}).get("entry", {}).get("level") == "error":
             self.faults.append(parameters)

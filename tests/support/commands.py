@@ -15,15 +15,14 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 
 BIN = Path(sys.executable).parent
+CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 # Of a user who has not activated .venv, so that commands print their whole path.
 PATH = os.pathsep.join(name for name in os.get_exec_path() if Path(name).resolve() != BIN.resolve())
 
 
 def start(program, *flags, cwd, **env):
-    command, environment = [str(BIN / program), *flags], {**os.environ, "PATH": PATH, **env}
-    return subprocess.Popen(
-        command, cwd=cwd, env=environment, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
-    )
+    command, env = [str(BIN / program), *flags], {**os.environ, "PATH": PATH, **env}
+    return subprocess.Popen(command, cwd=cwd, env=env, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True)
 
 
 @contextlib.contextmanager

@@ -35,7 +35,6 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, settings=No
 
 
 def run(learner, scenario, seed, percent, traffic=0, observation="rays", **more):
-    """A finished run with its errors."""
     figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
     figures |= {"velocity_error_percent": percent, "training_s": 10.0, "success_rate": 0.9} | more
     name = f"{scenario}-{learner}-s{seed}"

@@ -84,13 +84,8 @@ class Command:
 
 
 class Host:
-    """One machine. `folder` holds what its disk is from the outside: tmp, home.
-
-    Args:
-        folder: a new one.
-        keep: paths that are the same on each host (the checkout, Python).
-        hide: folders that are empty on this one.
-    """
+    """One machine. `folder`, a new one, holds what its disk is from the outside: tmp, home. Paths to `keep` are the
+    same on each host (the checkout, Python); folders to `hide` are empty on this one."""
 
     def __init__(self, folder: Path, keep: list[Path], hide: Collection[str] = ()):
         self.folder, self.home = folder, folder / "home"
@@ -144,7 +139,6 @@ class Host:
         self.address = address
 
     def serve_ssh(self, authorized: str) -> None:
-        """Let in who has the key."""
         (self.home / ".ssh" / "authorized_keys").write_text(authorized)
         self.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/host")
         options = (
@@ -155,7 +149,6 @@ class Host:
         self.run(shutil.which("sshd", path=SEARCH), "-f", "/dev/null", "-E", "/tmp/sshd.log", *flags)
 
     def processes(self) -> list[str]:
-        """Command lines of what runs there."""
         return [command_line(pid) for pid in descendants(self.pid)]
 
     def listening(self) -> dict[int, set[str]]:

@@ -36,9 +36,8 @@ def session(run, maps, on_event=lambda event: None, on_row=lambda steps, row: No
     run.path.mkdir(parents=True, exist_ok=True)
     run.write_config()
     untracked: Any = Untracked()
-    made = module.Session(
-        run, pool_of(maps), maps, untracked, on_event, on_row, module.perf_counter(), float("inf"), None
-    )
+    began, limit_s = module.perf_counter(), float("inf")
+    made = module.Session(run, pool_of(maps), maps, untracked, on_event, on_row, began, limit_s, None)
     config = made.learning.curriculum.config
     made.learning.curriculum.config = dataclasses.replace(config, validation=8, **curriculum)
     return made

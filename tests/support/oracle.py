@@ -123,10 +123,7 @@ class ExactRoad:
         return result
 
     def outline_on_road(self, poses: np.ndarray, half_length: float, half_width: float) -> np.ndarray:
-        """Whether the car's whole outline lies on the road: bool [n] for poses [n, 3] of x, y, heading.
-
-        Each side is a ray from one corner to the next: the outline is on the road if all four arrive.
-        """
+        """Whether a car's outline is on the road, as rays from corner to corner arrive: bool [n] for poses [n, 3]."""
         poses = np.asarray(poses, dtype=np.float64)
         on, corner = np.ones(len(poses), dtype=bool), corners(poses, half_length, half_width)
         for k in range(4):  # counter-clockwise, from the front right
@@ -185,10 +182,8 @@ def _in_capsule(p: np.ndarray, d: np.ndarray, lines: np.ndarray) -> tuple:
     u = np.where(length[:, None] > 0, b - a, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
     v = np.stack([-u[:, 1], u[:, 0]], axis=1)
     q = p - a
-    box = _meet(
-        _between(np.vecdot(q, u), np.vecdot(d, u), 0.0, length),
-        _between(np.vecdot(q, v), np.vecdot(d, v), -w, w),
-    )
+    along = _between(np.vecdot(q, u), np.vecdot(d, u), 0.0, length)
+    box = _meet(along, _between(np.vecdot(q, v), np.vecdot(d, v), -w, w))
     parts = (box, _in_disc(q, d, w), _in_disc(p - b, d, w))
     return np.minimum.reduce([i[0] for i in parts]), np.maximum.reduce([i[1] for i in parts])
 
@@ -200,10 +195,7 @@ def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[t
     e0 = np.stack([np.cos(first), np.sin(first)], axis=1)
     e1 = np.stack([np.cos(last), np.sin(last)], axis=1)
     n0, n1 = np.stack([-e0[:, 1], e0[:, 0]], axis=1), np.stack([e1[:, 1], -e1[:, 0]], axis=1)
-    sector = _meet(
-        _between(np.vecdot(q, n0), np.vecdot(d, n0), 0.0, np.inf),
-        _between(np.vecdot(q, n1), np.vecdot(d, n1), 0.0, np.inf),
-    )
+    sector = _meet(*(_between(np.vecdot(q, n), np.vecdot(d, n), 0.0, np.inf) for n in (n0, n1)))
     outer = _meet(sector, _in_disc(q, d, radius + w))
     hole = _in_disc(q, d, radius - w)
     before = _meet(outer, (np.full_like(hole[0], -np.inf), hole[0]))
@@ -261,11 +253,8 @@ def on_arc(config: SimConfig, pose: tuple, kappa: float, s: float) -> tuple:
 
 
 def advance(config: SimConfig, pose: tuple, speed: float, steering: float, acceleration: float) -> np.ndarray:
-    """One control period.
-
-    Returns: the moments at which the car's outline is looked at, [n, 5]: x, y, heading, speed, m driven; the last of
-    them is the end of the period.
-    """
+    """One control period: the moments at which the car's outline is looked at, [n, 5]: x, y, heading, speed, m driven;
+    the last of them is the end of the period."""
     dt = config.episode.control_period
     kappa = curvature(config, speed, steering)
     fastest = max(abs(speed), abs(speed + acceleration * dt))
@@ -320,11 +309,9 @@ class Books:
 
 
 def drive(config, road, interval, start, actions, target, max_steps):
-    """Drive a whole episode from start (x, y, heading, speed, steering) under given actions.
-
-    Returns: a row a control step, float64 [n, 7]: x, y (not wrapped over the torus), heading, speed, steering,
-    distance, distance at a speed within the interval; and the name of its End, "RUNNING" if the actions ran out.
-    """
+    """Drive a whole episode from start (x, y, heading, speed, steering) under given actions. Returns a row a control
+    step, float64 [n, 7]: x, y (not wrapped over the torus), heading, speed, steering, distance, distance at a speed
+    within the interval; and the name of its End, "RUNNING" if the actions ran out."""
     x, y, heading, speed, steering = map(float, start)
     books = Books(config, road, interval, x, y)
     steps, angles = [], []
@@ -366,11 +353,8 @@ def corners(poses: np.ndarray, a: float, b: float) -> np.ndarray:
 
 
 def rays_to_boxes(config, sides, origin, angles, poses, margin):
-    """How far rays [r] (rad) from one origin get before they meet a car at poses [n, 3], on a torus with these sides,
-    whose outlines are wider by `margin`: m [r], inf if not.
-
-    Each ray is intersected with each edge of each car, in this world and in those beside it; 0 from within a car.
-    """
+    """How far rays [r] (rad) from one origin get before they meet an edge of a car at poses [n, 3], in this world or in
+    those beside it, where outlines are wider by `margin`: m [r], inf if not, 0 from within a car."""
     shifts = np.array([[i * sides[0], j * sides[1], 0.0] for i in (-1, 0, 1) for j in (-1, 0, 1)])
     a, b = config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin
     outlines = corners((poses[:, None] + shifts).reshape(-1, 3), a, b) - origin

@@ -1,4 +1,4 @@
-"""What the tests of searches do with one."""
+"""What the tests of searches do with one, and those of experience."""
 
 import numpy as np
 
@@ -17,12 +17,15 @@ def state_of(search):
     return {name: array.tobytes() for name, array in search.state().items()}
 
 
+def to_bytes(experience):
+    return b"".join(array.tobytes() for array in experience)
+
+
 def first_gene(genomes):
     return genomes[:, 0].astype(float)
 
 
 def new_genomes(spec, n=1, seed=0):
-    """Random genomes float32 [n, genes]."""
     recipes = np.zeros(n, dtype=RECIPE)
     recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
     return breed(np.zeros((0, spec.size), dtype=np.float32), recipes, seed, spec, Mutation())

@@ -151,9 +151,8 @@ def mlflow_server(folder, port, *flags):
     command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
     with open(folder / "server.log", "a") as log:
         quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-        server = subprocess.Popen(
-            [*command, *flags], cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True
-        )
+        command += flags
+        server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
     try:
         wait_until(lambda: not unreachable(f"http://127.0.0.1:{port}"), pause=0.2)
         yield
