@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from cluster.learn.maps import Maps
@@ -58,7 +56,7 @@ class Evaluator:
 
         Raises: GridSimError, a ValueError, in one line.
         """
-        observation = "grid" if policy.startswith("cnn") else "rays"
+        observation = PolicySpec.parse(policy).observation if policy else "rays"
         settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, observation=observation)
         settings.check()
         check_workers(workers, 0.0)
@@ -119,8 +117,8 @@ class Evaluator:
         members = Generation(np.zeros((0, self.genes), np.float32), recipes(0)).and_copies(self._checked(genomes))
         scenario = self._settings.scenario
         names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
-        shared: tuple[Any, ...] = (str(self.spec), episodes.rows, episodes.worlds, names, self._sim)
-        task = Task(*shared, members.parents, members.key, members.mutation)
+        shared = str(self.spec), episodes.rows, episodes.worlds, names, self._sim
+        task = Task(*shared, parents=members.parents, key=members.key, mutation=members.mutation)
         return self._pool.run(Outcome(task, members.recipes)).results
 
     def _checked(self, genomes: np.ndarray) -> np.ndarray:

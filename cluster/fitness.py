@@ -110,7 +110,7 @@ def _find(name: str) -> Fitness:
         raise GridSimError(f"--fitness {name} cannot be imported: {_fault(error)}") from error
     if not callable(function):
         raise GridSimError(f"--fitness {name}: {attribute} is not a function")
-    return function  # type: ignore[no-any-return]
+    return function
 
 
 def _module_of_file(path: str) -> Any:
