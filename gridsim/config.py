@@ -71,6 +71,14 @@ class VehicleConfig:
     # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking it is 9.4:
     # less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
     lateral_grip: float = 4.9
+    # kinematic, or single_track with what follows: linear tyres, without the limit of `lateral_grip`. The numbers are
+    # those of CommonRoad's vehicle 2, a BMW 320i (Althoff et al. 2017).
+    model: str = "kinematic"
+    mass: float = 1093.3  # kg
+    yaw_inertia: float = 1791.6  # kg m2
+    mass_height: float = 0.6137  # m, of the centre of mass
+    friction: float = 1.0489  # of tyres and road
+    cornering_stiffness: float = 20.898  # 1/rad, of an axle, per load
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gridsim.car.models import Model
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
@@ -27,13 +28,14 @@ class Physics(NamedTuple):
     constants: Constants
     drivers: Drivers
     fan: np.ndarray
+    model: Model
 
 
 @njit
 def _on_map(physics, row):
     """The Simulation of a map of the atlas."""
     road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
-    return Simulation(road, network, physics.constants, physics.drivers, physics.fan)
+    return Simulation(road, network, physics.constants, physics.drivers, physics.fan, physics.model)
 
 
 @njit(nogil=True)

@@ -21,7 +21,8 @@ IDLE = 10  # control steps in a row without progress
 STEPS = 11  # control steps
 CELL = 12  # index of the visit cell the car is in
 FRESH = 13  # 1 if this cell's ground is new
-CAR_FIELDS = 14
+YAW_RATE, SLIP = 14, 15  # rad/s, and rad between heading and course, of a dynamic vehicle model; else 0
+CAR_FIELDS = 16
 
 # Further columns of a car of the traffic.
 LANE = 5  # index of its lane; -1 for an absent car, which is ignored

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
-from gridsim.car.vehicle import advance, front_velocity, path_curvature
+from gridsim.car.models import Model, front_velocity, model_of, move
+from gridsim.car.vehicle import path_curvature
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, I, leaf, njit
 from gridsim.maps.map import Map
@@ -34,12 +35,13 @@ class Simulation(NamedTuple):
     constants: Constants
     drivers: Drivers
     fan: np.ndarray  # of `rays.fan`
+    model: Model  # of the vehicle
 
 
-def parameters(config: SimConfig) -> tuple[Constants, Drivers, np.ndarray]:
+def parameters(config: SimConfig) -> tuple[Constants, Drivers, np.ndarray, Model]:
     """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
     k = constants(config)
-    return k, drivers(config), fan(config.sensors.rays, k.ray_first, k.ray_step)
+    return k, drivers(config), fan(config.sensors.rays, k.ray_first, k.ray_step), model_of(config.vehicle)
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
@@ -100,7 +102,7 @@ def look(simulation, car, world, ranges, closing):
     if world is not None:
         velocity = (ZERO, ZERO)
         if closing is not None:
-            velocity = front_velocity(constants, car[SPEED], car[STEERING])
+            velocity = front_velocity(simulation.model, constants, car)
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
 
 
@@ -129,7 +131,9 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     moved = ZERO
     crashed = False
     for part in range(parts):
-        x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
+        x, y, cosine, sine, speed, length = move(
+            simulation.model, constants, car, x, y, cosine, sine, speed, acceleration, curvature, dt
+        )
         moved += length
         if collides(road, constants, x, y, cosine, sine):
             crashed = True
