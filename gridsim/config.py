@@ -79,6 +79,7 @@ class VehicleConfig:
     mass_height: float = 0.6137  # m, of the centre of mass
     friction: float = 1.0489  # of tyres and road
     cornering_stiffness: float = 20.898  # 1/rad, of an axle, per load
+    latency: float = 0.0  # s by which commands are late
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,10 @@ class SensorConfig:
     rays: int = 31
     field_of_view: float = 120.0  # degrees, centred on the heading
     range: float = 50.0  # m; readings are ranges / range, in [0, 1]
+    noise: float = 0.0  # m, standard deviation of a reading
+    noise_share: float = 0.0  # the same, as a share of the range
+    dropout: float = 0.0  # share of readings that are the full range, whatever is there
+    latency: float = 0.0  # s by which readings are late
 
 
 @dataclass(frozen=True)

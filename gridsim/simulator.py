@@ -11,9 +11,10 @@ from gridsim.car.models import Model
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import ZERO, F, I, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
+from gridsim.sensing.imperfections import Delays, History, Imperfections, imperfections, late_command
 from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 from gridsim.traffic.behaviour import Drivers
@@ -29,17 +30,28 @@ class Physics(NamedTuple):
     drivers: Drivers
     fan: np.ndarray
     model: Model
+    wrong: Imperfections | None
+    delays: Delays | None
 
 
 @njit
 def _on_map(physics, row):
     """The Simulation of a map of the atlas."""
     road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
-    return Simulation(road, network, physics.constants, physics.drivers, physics.fan, physics.model)
+    k, drivers, fan, model, wrong, delays = physics[1:]
+    return Simulation(road, network, k, drivers, fan, model, wrong, delays)
+
+
+@njit
+def _history_of(histories, i):
+    """The History of car i; None without delays."""
+    if histories is None:
+        return None
+    return History(histories[0][i], histories[1][i])
 
 
 @njit(nogil=True)
-def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
+def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing, histories):
     """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
     for row, first, last in runs:
         simulation = _on_map(physics, row)
@@ -47,11 +59,11 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges
             i = which[k]
             world = None if worlds is None else worlds[i]
             place(simulation, starts[k], cars[i], visits[i])
-            look(simulation, cars[i], world, ranges[i], closing[i])
+            look(simulation, cars[i], world, ranges[i], closing[i], _history_of(histories, i))
 
 
 @njit(nogil=True)
-def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen):
+def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen, histories):
     """One control period of every car; one whose episode has ended stands still.
 
     Args: cars `order` map by map; runs int64 [maps, 3], a map's row in the atlas and its cars' range in `order`; seen,
@@ -66,15 +78,16 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
             car = cars[i]
             world = None if worlds is None else worlds[i]
             before = car[DISTANCE]
-            runs_on = ends[i] == 0
+            runs_on, history = ends[i] == 0, _history_of(histories, i)
             if runs_on:
                 if actions.ndim == 1:
-                    acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
+                    action, _ = late_command(history, car, F(actions[i]), ZERO, F(4.0))  # 4: none
+                    acceleration, steering = act(constants, I(action), car[SPEED], car[STEERING])
                 else:
-                    pedal, wheel = actions[i, 0], actions[i, 1]
+                    pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
                     acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
                 ends[i] = step(simulation, car, visits[i], world, acceleration, steering, target, max_steps)
-            look(simulation, car, world, ranges[i], closing[i])
+            look(simulation, car, world, ranges[i], closing[i], history)
             if runs_on:
                 gained = car[DISTANCE] - before
                 rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
@@ -129,6 +142,11 @@ class Simulator:
         self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self.closing = np.zeros_like(self.ranges)
         self._physics: Physics | None = None  # made when a kernel first needs it
+        delays, rays = imperfections(self.config)[1], self.config.sensors.rays
+        self._histories = delays and (
+            np.zeros((cars, delays.readings, 2, rays), dtype=np.float32),
+            np.zeros((cars, delays.commands, 2), dtype=np.float32),
+        )
         self.maps: dict[int, Map] = {}  # of each car that was reset
         self._row_of: dict[Map, int] = {}  # the maps in the atlas
         self._rows = np.full(cars, -1)  # of each car's map in the atlas
@@ -171,7 +189,8 @@ class Simulator:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
         (physics, worlds), groups = self._for_kernels(), _by_map(self._rows[cars])
-        _place_all(physics, *groups, cars, starts, self.cars, self.visits, worlds, self.ranges, self.closing)
+        arrays = self.cars, self.visits, worlds, self.ranges, self.closing, self._histories
+        _place_all(physics, *groups, cars, starts, *arrays)
 
     def forget_maps(self) -> None:
         """Have the next reset keep only maps on which there are cars."""
@@ -210,7 +229,7 @@ class Simulator:
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
         physics, worlds = self._for_kernels()
-        arrays = self.cars, self.visits, worlds, self.ends, (self.ranges, self.closing, rewards)
+        arrays = self.cars, self.visits, worlds, self.ends, (self.ranges, self.closing, rewards), self._histories
         _control_all(physics, *self._groups, actions, np.float32(self.target), self.max_steps, *arrays)
         return rewards
 
@@ -224,7 +243,7 @@ def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     closing = np.zeros_like(ranges)
     for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
-        look(simulation, car, world, seen, speeds)
+        look(simulation, car, world, seen, speeds, None)
     return ranges, closing
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from gridsim.jit import ONE, ZERO, F, I, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
+from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections, late_readings
 from gridsim.sensing.rays import cast_boxes, fan, sense
 from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
@@ -36,12 +37,15 @@ class Simulation(NamedTuple):
     drivers: Drivers
     fan: np.ndarray  # of `rays.fan`
     model: Model  # of the vehicle
+    wrong: Imperfections | None  # with the sensor
+    delays: Delays | None
 
 
-def parameters(config: SimConfig) -> tuple[Constants, Drivers, np.ndarray, Model]:
+def parameters(config: SimConfig) -> tuple[Any, ...]:
     """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
     k = constants(config)
-    return k, drivers(config), fan(config.sensors.rays, k.ray_first, k.ray_step), model_of(config.vehicle)
+    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    return k, drivers(config), rays, model_of(config.vehicle), *imperfections(config)
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
@@ -90,10 +94,11 @@ def start_from(car, start):
 
 
 @leaf
-def look(simulation, car, world, ranges, closing):
+def look(simulation, car, world, ranges, closing, history):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
     Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `rays.cast_boxes`.
+    With a `history` they are as late as the simulation's delays.
     """
     road, constants, fan = simulation.road, simulation.constants, simulation.fan
     x = car[X] + constants.front_axle * car[COS]
@@ -104,6 +109,8 @@ def look(simulation, car, world, ranges, closing):
         if closing is not None:
             velocity = front_velocity(simulation.model, constants, car)
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
+    degrade(simulation.wrong, constants.ray_range, car, ranges)
+    late_readings(history, car, ranges, closing)
 
 
 @leaf

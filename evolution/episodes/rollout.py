@@ -19,9 +19,10 @@ from gridsim.car.vehicle import act
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import F, U, freeze, leaf, njit
+from gridsim.jit import ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
+from gridsim.sensing.imperfections import History, late_command, new_history
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
@@ -75,6 +76,7 @@ class Workspace(NamedTuple):
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
+    history: History | None  # with delays
 
 
 @leaf
@@ -102,6 +104,7 @@ def make_workspace(simulation, layers, rows, cars):
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
+        new_history(simulation.delays, simulation.constants.rays),
     )
 
 
@@ -122,7 +125,7 @@ class Recorder(NamedTuple):
 @leaf
 def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
-    look(simulation, car, world, workspace.ranges, closing)
+    look(simulation, car, world, workspace.ranges, closing, workspace.history)
     if grid_buffers is None:
         encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:
@@ -164,13 +167,14 @@ def _explore(recorder, steps, action, actions):
 
 
 @leaf
-def _drive(simulation, setup, car, visits, world, action):
+def _drive(simulation, setup, car, workspace, world, action):
     """One control step with an action. Returns an End as a number.
 
     A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
-    acceleration, steering = act(simulation.constants, action, car[SPEED], car[STEERING])
-    return step(simulation, car, visits, world, acceleration, steering, setup.target, setup.steps)
+    late, _ = late_command(workspace.history, car, F(action), ZERO, F(4.0))  # 4: none
+    acceleration, steering = act(simulation.constants, I(late), car[SPEED], car[STEERING])
+    return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
 
 
 @njit(nogil=True)
@@ -206,7 +210,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             if world is not None:
                 _copy_world(world, workspace.world_ring[steps % keep])
         before = car[DISTANCE]
-        end = _drive(simulation, setup, car, workspace.visits, world, action)
+        end = _drive(simulation, setup, car, workspace, world, action)
         steps += 1
     result["distance"], result["paced"] = car[DISTANCE], car[PACED]
     result["steps"], result["end"] = steps, end

@@ -1,0 +1,121 @@
+"""What real sensors and actuators do: noise, rays that read nothing, and readings and commands that come late.
+
+Noise depends only on where a car is and on its control step, so it is the same for any number of workers. Without
+imperfections the parameters are None, so that kernels are compiled without them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.counter import GOLDEN, mix
+from gridsim.jit import ZERO, F, I, U, leaf, njit
+from gridsim.state import STEPS, X, Y
+
+_SIDES = F(math.sqrt(3.0) / 1024.0)  # scales the sum of four whole numbers below 1,024 to a variance of 1
+
+
+class Imperfections(NamedTuple):
+    """Of the range sensor, as kernels read them."""
+
+    noise: np.float32  # m, standard deviation
+    noise_share: np.float32  # the same, as a share of the range
+    dropout: np.uint64  # of 2 ** 24 readings, those that are the sensor's full range
+
+
+class Delays(NamedTuple):
+    """Control steps by which readings and commands are late."""
+
+    readings: int
+    commands: int
+
+
+class History(NamedTuple):
+    """What a car has seen and was told, and does not know or do yet."""
+
+    readings: np.ndarray  # float32 [steps, 2, rays], ranges and closing speeds
+    commands: np.ndarray  # float32 [steps, 2]
+
+
+def imperfections(config: SimConfig) -> tuple[Imperfections | None, Delays | None]:
+    """Those of a configuration; None for a perfect sensor, and for no delay. Raises: ValueError."""
+    sensors, period = config.sensors, config.episode.control_period
+    for name, value, most in (
+        ("noise", sensors.noise, 10.0),
+        ("noise_share", sensors.noise_share, 1.0),
+        ("dropout", sensors.dropout, 1.0),
+        ("sensors.latency", sensors.latency, 2.0),
+        ("vehicle.latency", config.vehicle.latency, 2.0),
+    ):
+        if not 0.0 <= value <= most:
+            raise ValueError(f"{name} must be 0 to {most:g}, not {value}")
+    wrong = None
+    if sensors.noise or sensors.noise_share or sensors.dropout:
+        wrong = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
+    delays = Delays(round(sensors.latency / period), round(config.vehicle.latency / period))
+    return wrong, delays if any(delays) else None
+
+
+@leaf
+def degrade(wrong, reach, car, ranges):
+    """Add noise to ranges (m) within the sensor's reach, and drop some of them."""
+    if wrong is None:
+        return
+    place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre
+    key = mix(mix(place) + U(I(car[STEPS])))
+    for r in range(ranges.shape[0]):
+        bits = mix(key + U(r + 1) * GOLDEN)
+        if bits >> U(40) < wrong.dropout:
+            ranges[r] = reach
+            continue
+        # Nearly normal: the sum of four uniform numbers (Irwin-Hall).
+        total = (bits & U(1023)) + (bits >> U(10) & U(1023)) + (bits >> U(20) & U(1023)) + (bits >> U(30) & U(1023))
+        normal = (F(total) - F(2046.0)) * _SIDES
+        noisy = ranges[r] + (wrong.noise + wrong.noise_share * ranges[r]) * normal
+        ranges[r] = min(max(noisy, ZERO), reach)
+
+
+@njit
+def new_history(delays, rays):
+    """The History of one car; None without delays."""
+    if delays is None:
+        return None
+    readings = np.zeros((delays.readings, 2, rays), dtype=np.float32)
+    return History(readings, np.zeros((delays.commands, 2), dtype=np.float32))
+
+
+@leaf
+def late_readings(history, car, ranges, closing):
+    """Put the readings of some steps ago in place of the latest ones; before there are any, the first ones."""
+    if history is None or history.readings.shape[0] == 0:
+        return
+    steps, slot = I(history.readings.shape[0]), I(car[STEPS]) % I(history.readings.shape[0])
+    for r in range(ranges.shape[0]):
+        newest = ranges[r]
+        if car[STEPS] == ZERO:
+            for k in range(steps):
+                history.readings[k, 0, r] = newest
+        ranges[r], history.readings[slot, 0, r] = history.readings[slot, 0, r], newest
+        if closing is not None:
+            speed = closing[r]
+            if car[STEPS] == ZERO:
+                for k in range(steps):
+                    history.readings[k, 1, r] = speed
+            closing[r], history.readings[slot, 1, r] = history.readings[slot, 1, r], speed
+
+
+@leaf
+def late_command(history, car, first, second, neutral):
+    """The command of some steps ago, two numbers, in place of the latest one; before there is any, neutral and 0."""
+    if history is None or history.commands.shape[0] == 0:
+        return first, second
+    slot = I(car[STEPS]) % I(history.commands.shape[0])
+    late = neutral, ZERO
+    if I(car[STEPS]) >= I(history.commands.shape[0]):
+        late = history.commands[slot, 0], history.commands[slot, 1]
+    history.commands[slot, 0], history.commands[slot, 1] = first, second
+    return late

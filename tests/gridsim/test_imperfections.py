@@ -1,0 +1,103 @@
+"""Noise, dropped rays and latency: their sizes, and that drives under them are the same wherever they are driven."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evolution.episodes.rollout import trajectory
+from evolution.networks.policy import PolicySpec, act_on
+from gridsim.config import SensorConfig, SimConfig, VehicleConfig
+from gridsim.envs.env import GridSimEnv
+from gridsim.maps.map import Map, sample_starts
+from gridsim.maps.scenarios import build
+from gridsim.simulator import Simulator
+
+ALL = SimConfig(
+    vehicle=VehicleConfig(latency=0.2),
+    sensors=SensorConfig(noise=0.1, noise_share=0.02, dropout=0.05, latency=0.3),
+)
+
+
+@pytest.fixture(scope="module")
+def road() -> Map:
+    return build("curved", 1)
+
+
+def drive(config: SimConfig, road: Map, actions: np.ndarray, cars: int = 1, traffic: int = 0) -> tuple:
+    """States and ranges [steps + 1, cars, ...] of a drive with actions [steps, cars]."""
+    simulator = Simulator(cars, config, traffic=traffic)
+    simulator.reset(road, sample_starts(road, cars, np.random.default_rng(0)))
+    states, ranges = [simulator.cars.copy()], [simulator.ranges.copy()]
+    for each in actions:
+        simulator.step(each)
+        states.append(simulator.cars.copy())
+        ranges.append(simulator.ranges.copy())
+    return np.array(states), np.array(ranges)
+
+
+def test_noise_and_dropout_have_their_sizes(road: Map) -> None:
+    actions = np.random.default_rng(1).integers(8, size=(12, 2000))
+    _, true = drive(SimConfig(), road, actions, 2000)
+    noisy_sim = SimConfig(sensors=SensorConfig(noise=0.1, noise_share=0.02, dropout=0.05))
+    _, noisy = drive(noisy_sim, road, actions, 2000)
+    moved = slice(3, None)  # all cars drive
+    true, noisy = true[moved], noisy[moved]
+    inside = (true > 2.0) & (true < 45.0)
+    dropped = inside & (noisy == 50.0)
+    assert dropped.sum() / inside.sum() == pytest.approx(0.05, abs=0.002)
+    error = (noisy - true)[inside & ~dropped] / (0.1 + 0.02 * true[inside & ~dropped])
+    assert error.mean() == pytest.approx(0.0, abs=0.01)
+    assert error.std() == pytest.approx(1.0, abs=0.01)
+    assert np.abs(error).max() < np.sqrt(12.0) + 0.01
+    assert ((noisy >= 0.0) & (noisy <= 50.0)).all()
+    one, next_one = error[:-1], error[1:]
+    assert np.corrcoef(one, next_one)[0, 1] == pytest.approx(0.0, abs=0.02), "each reading has noise of its own"
+
+
+def test_readings_and_commands_are_late_by_the_control_steps_of_their_latency(road: Map) -> None:
+    actions = np.random.default_rng(1).choice([0, 5, 6], size=(11, 5))  # too few for a crash
+    states, ranges = drive(SimConfig(), road, actions, 5)
+    same, late = drive(SimConfig(sensors=SensorConfig(latency=0.3)), road, actions, 5)
+    assert same.tobytes() == states.tobytes()
+    assert late[3:].tobytes() == ranges[:-3].tobytes()
+    assert (late[:3] == ranges[0]).all()
+    coming = np.concatenate([np.full((2, 5), 4), actions[:-2]])  # first none
+    assert drive(SimConfig(VehicleConfig(latency=0.2)), road, actions, 5)[0].tobytes() == (
+        drive(SimConfig(), road, coming, 5)[0].tobytes()
+    )
+    pedals = np.random.default_rng(2).uniform(0.0, 1.0, size=(11, 5, 2)).astype(np.float32)
+    none = np.concatenate([np.zeros((2, 5, 2), np.float32), pedals[:-2]])
+    assert drive(SimConfig(VehicleConfig(latency=0.2)), road, pedals, 5)[0].tobytes() == (
+        drive(SimConfig(), road, none, 5)[0].tobytes()
+    )
+
+
+def test_a_network_drives_in_the_environment_as_in_training(road: Map) -> None:
+    spec, rng = PolicySpec.parse("mlp:8+steering"), np.random.default_rng(3)
+    start, steps = sample_starts(road, 1, rng)[0], 0
+    while steps < 60:
+        genome = rng.normal(size=spec.size).astype(np.float32)
+        result, states, _ = trajectory(spec, genome, road, start, 2000.0, 300, ALL)
+        steps = int(result["steps"])
+    env = GridSimEnv("curved", config=ALL, steering=True, max_episode_steps=300)
+    seen, _ = env.reset(seed=0, options={"map_seed": 1, "start": start})
+    for step in range(1, steps + 1):
+        seen, _, terminated, _, info = env.step(act_on(spec, genome, seen, ALL))
+        assert info["distance_m"] == pytest.approx(float(states[step, 6]), abs=1e-3)
+    assert terminated or steps == 300
+    perfect, *_ = trajectory(spec, genome, road, start, 2000.0, 300, SimConfig())
+    assert perfect["distance"] != result["distance"]
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("sensors", "noise", -0.1), ("sensors", "noise_share", np.nan), ("sensors", "dropout", 1.5),
+        ("sensors", "latency", 3.0), ("vehicle", "latency", -0.1),
+    ],
+)  # fmt: skip
+def test_wrong_numbers_are_refused(part: str, name: str, value: float) -> None:
+    config = replace(SimConfig(), **{part: replace(getattr(SimConfig(), part), **{name: value})})
+    with pytest.raises(ValueError, match=rf"{name} must be 0 to "):
+        Simulator(1, config).reset(build("curved", 1), np.zeros((1, 5)))
