@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -143,6 +143,18 @@ class SimConfig:
     sensors: SensorConfig = field(default_factory=SensorConfig)
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
+    # Numbers of the vehicle that are drawn for each episode, uniformly: name, least and most.
+    randomise: tuple[tuple[str, float, float], ...] = ()
+
+    def drawn(self, start: np.ndarray) -> SimConfig:
+        """The configuration of the episode with a start float32 [5]: the same start gives the same vehicle."""
+        if not self.randomise:
+            return self
+        rng = np.random.default_rng(
+            np.random.SeedSequence(np.asarray(start, dtype=np.float32).view(np.uint32).tolist())
+        )
+        values: dict[str, Any] = {name: float(rng.uniform(least, most)) for name, least, most in self.randomise}
+        return replace(self, vehicle=replace(self.vehicle, **values), randomise=())
 
 
 class Constants(NamedTuple):
@@ -191,6 +203,14 @@ def constants(config: SimConfig) -> Constants:
     apart = vehicle.length + config.traffic.jam
     if not min(config.traffic.spawn_gap, config.traffic.spawn_gap_ego) >= apart:
         raise ValueError(f"spawn_gap and spawn_gap_ego must be at least a car's length plus jam, {apart:g} m")
+    for name, *ends in config.randomise:
+        if not isinstance(getattr(vehicle, name, ""), float):
+            raise ValueError(f"randomise: the vehicle has no number {name!r}")
+        if not ends[0] <= ends[1]:
+            raise ValueError(f"randomise: {name} must be least and most, not {ends[0]:g} and {ends[1]:g}")
+        for value in ends:
+            changed: dict[str, Any] = {name: value}
+            constants(replace(config, vehicle=replace(vehicle, **changed), randomise=()))
     if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
         raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)

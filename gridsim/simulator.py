@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,6 +142,8 @@ class Simulator:
         self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self.closing = np.zeros_like(self.ranges)
         self._physics: Physics | None = None  # made when a kernel first needs it
+        self._starts = np.zeros((cars, 5), dtype=np.float32)
+        self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
         delays, rays = imperfections(self.config)[1], self.config.sensors.rays
         self._histories = delays and (
             np.zeros((cars, delays.readings, 2, rays), dtype=np.float32),
@@ -154,7 +156,7 @@ class Simulator:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without read-only arrays: their copies would be writable, and kernels would be compiled again for them."""
-        return {**vars(self), "_physics": None}
+        return {**vars(self), "_physics": None, "_drawn": {}}
 
     def __len__(self) -> int:
         return len(self.ends)
@@ -188,20 +190,36 @@ class Simulator:
         if cells > self.visits.shape[1]:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
-        (physics, worlds), groups = self._for_kernels(), _by_map(self._rows[cars])
-        arrays = self.cars, self.visits, worlds, self.ranges, self.closing, self._histories
-        _place_all(physics, *groups, cars, starts, *arrays)
+        self._starts[cars] = starts
+        for i in cars.tolist():
+            self._drawn.pop(i, None)
+        arrays = self.cars, self.visits, self._traffic(), self.ranges, self.closing, self._histories
+        for batch in self._batches(cars):
+            _place_all(*batch, cars, starts, *arrays)
 
     def forget_maps(self) -> None:
         """Have the next reset keep only maps on which there are cars."""
         self._row_of = {}
 
-    def _for_kernels(self) -> tuple[Physics, np.ndarray | None]:
-        """What all cars share, and the worlds, or None without traffic."""
+    def _traffic(self) -> np.ndarray | None:
+        """The worlds, or None without traffic."""
+        return self.worlds if self.worlds.shape[1] else None
+
+    def _batches(self, cars: np.ndarray | None = None) -> Iterator[tuple[Physics, np.ndarray, np.ndarray]]:
+        """Cars [k], by default all, in batches with the same physics: that, `order` and `runs` as kernels read them.
+
+        Randomised vehicles have a batch each.
+        """
         if self._physics is None:
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
             self._physics = Physics(atlas, *parameters(self.config))
-        return self._physics, self.worlds if self.worlds.shape[1] else None
+        if not self.config.randomise:
+            yield self._physics, *(self._groups if cars is None else _by_map(self._rows[cars]))
+            return
+        for k, i in enumerate(range(len(self)) if cars is None else cars.tolist()):
+            if i not in self._drawn:
+                self._drawn[i] = parameters(self.config.drawn(self._starts[i]))
+            yield Physics(self._physics.atlas, *self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
@@ -228,9 +246,10 @@ class Simulator:
             raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
-        physics, worlds = self._for_kernels()
-        arrays = self.cars, self.visits, worlds, self.ends, (self.ranges, self.closing, rewards), self._histories
-        _control_all(physics, *self._groups, actions, np.float32(self.target), self.max_steps, *arrays)
+        seen = self.ranges, self.closing, rewards
+        arrays = self.cars, self.visits, self._traffic(), self.ends, seen, self._histories
+        for batch in self._batches():
+            _control_all(*batch, actions, np.float32(self.target), self.max_steps, *arrays)
         return rewards
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 from rich.console import Console
+from rich.progress import track
 
 from cluster import fitness, stopping
 from cluster.commands.common import (
@@ -34,12 +35,13 @@ from cluster.commands.common import (
 )
 from cluster.commands.entry import STARTED
 from cluster.commands.progress import RunDisplay
-from cluster.commands.tables import errors_table, held_out_table
+from cluster.commands.tables import errors_table, held_out_table, stress_table
 from cluster.compare.results import series
+from cluster.report import stress
 from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.stopping import INTERRUPTED
-from cluster.store.champion import evaluate, load_champion
+from cluster.store.champion import Champion, evaluate, load_champion
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError, write_json
 from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.text import as_argument, count
@@ -117,6 +119,9 @@ class EvaluateFlags(RoadFlags):
     """Number of episodes; the default 64 are the held-out episodes of every run."""
     errors: bool = False
     """Also its velocity and steering errors against the reference driver."""
+    stress: bool = False
+    """Also drive it with more and more noise, dropped readings, latency and ever less grip: a table, and stress.png
+    beside the champion."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -295,15 +300,34 @@ def _evaluate() -> int:
     chosen = (road, flags.episodes, flags.seed, traffic)
     figures = evaluate(champion, *chosen)
     missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
+    place = Path(flags.champion)
+    picture = (place if place.is_dir() else place.parent) / stress.PICTURE
+    found = _stress(champion, chosen, picture, flags) if flags.stress else []
     if flags.json:
-        print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
+        more: dict[str, Any] = {} if missed is None else {"errors": missed}
+        if found:
+            more["stress"] = [{"what": each.name, "level": level, **driven} for each, level, driven in found]
+        print(json.dumps({**figures, **more}))
         return 0
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     new_console().print(held_out_table(title, figures))
     if missed is not None:
         new_console().print(errors_table("Errors against the reference driver", missed))
+    if found:
+        new_console().print(stress_table(found), f"picture: {short_path(picture)}", sep="\n", soft_wrap=True)
     return 0
+
+
+def _stress(champion: Champion, chosen: tuple[str, int, int, int], picture: Path, flags: EvaluateFlags) -> list[Any]:
+    """Drive a champion under each stress, and draw it."""
+    asked = stress.stresses(champion)
+    drives = stress.drive(champion, asked, *chosen)
+    total = sum(len(each.levels) for each in asked)
+    shown = new_console(stderr=True)
+    found = list(track(drives, "driving under stress", total, console=shown, transient=True, disable=flags.json))
+    stress.draw(found, f"{flags.champion} on {label(chosen[0])}", picture)
+    return found
 
 
 evolve_main, dqn_main = (partial(main, prog, partial(_learn, prog)) for prog in FLAGS)

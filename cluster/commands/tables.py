@@ -1,8 +1,10 @@
 """Tables of how a champion drives, for the terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.table import Column, Table
+
+from cluster.report.stress import Stress
 
 
 def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
@@ -29,4 +31,14 @@ def errors_table(title: str, figures: Mapping[str, float]) -> Table:
     ):
         table.add_row(head, f"{figures[mean]:.{digits}f}", f"{figures[largest]:.{digits}f}")
     table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
+    return table
+
+
+def stress_table(found: Sequence[tuple[Stress, float, Mapping[str, float]]]) -> Table:
+    """Success at each level of each stress."""
+    table = Table(title="Success under stress", title_justify="left", show_header=False)
+    for stress in dict.fromkeys(each for each, _, _ in found):
+        rows = [(level, figures["success_rate"]) for each, level, figures in found if each == stress]
+        table.add_row(stress.label, *(f"{level:g}" for level, _ in rows), style="dim")
+        table.add_row("", *(f"{share:.0%}" for _, share in rows), end_section=True)
     return table

@@ -290,11 +290,14 @@ def evaluate(
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     simulations = simulations_on(road_maps, config)
     for column, episode in enumerate(episodes):
+        simulation = simulations[episode["map"]]
+        if config.randomise:
+            simulation = simulations_on([road_maps[episode["map"]]], config.drawn(episode["start"]))[0]
         setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
         traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
         row = kept[column]
         _rollout(
-            simulations[episode["map"]], genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
+            simulation, genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
             results[column], rewound[row], rewound_worlds[row],
         )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
@@ -326,11 +329,14 @@ def collect(
     results = np.zeros(len(episodes), dtype=RESULT)
     # Room for episodes of any length.
     experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
-    for m in np.unique(episodes["map"]):
-        which = np.flatnonzero(episodes["map"] == m)
-        _collect(
-            simulations[m], weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results
-        )
+    together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # those with one simulation
+    for group in np.unique(together):
+        which = np.flatnonzero(together == group)
+        m = int(episodes["map"][which[0]])
+        simulation = simulations[m]
+        if config.randomise:
+            simulation = simulations_on([road_maps[m]], config.drawn(episodes["start"][group]))[0]
+        _collect(simulation, weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results)
     driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
     return Experience(*(array[driven] for array in experience)), results
 
@@ -351,7 +357,8 @@ def trajectory(
     Returns: (RESULT []; before each step and at the end, the states float32 [steps + 1, CAR_FIELDS], and the traffic
     float32 [steps + 1, cars, TRAFFIC_FIELDS]).
     """
-    simulation, cars = simulations_on([road_map], config)[0], 0 if world is None else len(world)
+    simulation = simulations_on([road_map], config.drawn(start))[0]
+    cars = 0 if world is None else len(world)
     workspace = make_workspace(simulation, spec.layers, steps + 1, cars)
     closing, grid_buffers = policy_buffers(spec, config)
     world = world.copy() if world is not None and cars else None

@@ -1,5 +1,6 @@
 """Noise, dropped rays and latency: their sizes, and that drives under them are the same wherever they are driven."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +13,12 @@ from gridsim.envs.env import GridSimEnv
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
+from gridsim.state import DISTANCE, SPEED
 
 ALL = SimConfig(
     vehicle=VehicleConfig(latency=0.2),
     sensors=SensorConfig(noise=0.1, noise_share=0.02, dropout=0.05, latency=0.3),
+    randomise=(("lateral_grip", 3.0, 4.9), ("steering_rate", 40.0, 60.0)),
 )
 
 
@@ -84,10 +87,42 @@ def test_a_network_drives_in_the_environment_as_in_training(road: Map) -> None:
     seen, _ = env.reset(seed=0, options={"map_seed": 1, "start": start})
     for step in range(1, steps + 1):
         seen, _, terminated, _, info = env.step(act_on(spec, genome, seen, ALL))
-        assert info["distance_m"] == pytest.approx(float(states[step, 6]), abs=1e-3)
+        assert info["distance_m"] == pytest.approx(float(states[step, DISTANCE]), abs=1e-3)
     assert terminated or steps == 300
     perfect, *_ = trajectory(spec, genome, road, start, 2000.0, 300, SimConfig())
     assert perfect["distance"] != result["distance"]
+
+
+def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> None:
+    starts = sample_starts(road, 200, np.random.default_rng(0))
+    drawn = [ALL.drawn(start).vehicle for start in starts]
+    grips = np.array([vehicle.lateral_grip for vehicle in drawn])
+    assert grips.min() >= 3.0
+    assert grips.max() <= 4.9
+    assert grips.std() > 0.4
+    assert ALL.drawn(starts[7]) == ALL.drawn(starts[7].copy())
+    simulator = Simulator(200, replace(SimConfig(), randomise=(("acceleration", 1.0, 3.0),)))
+    simulator.reset(road, starts)
+    simulator.step(np.zeros(200, dtype=np.int64))
+    copy = deepcopy(simulator)
+    copy.step(np.zeros(200, dtype=np.int64))
+    wanted = [simulator.config.drawn(start).vehicle.acceleration for start in starts]
+    np.testing.assert_allclose(simulator.cars[:, SPEED], 0.1 * np.array(wanted), rtol=1e-5)
+    np.testing.assert_allclose(copy.cars[:, SPEED], 0.2 * np.array(wanted), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("randomise", "said"),
+    [
+        ((("wings", 1.0, 2.0),), "the vehicle has no number 'wings'"),
+        ((("model", 1.0, 2.0),), "the vehicle has no number 'model'"),
+        ((("width", 2.0, 1.0),), "width must be least and most, not 2 and 1"),
+        ((("width", 0.0, 1.0),), "width must be above 0, not 0.0"),
+    ],
+)
+def test_wrong_ranges_are_refused(randomise: tuple, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Simulator(1, replace(SimConfig(), randomise=randomise))
 
 
 @pytest.mark.parametrize(

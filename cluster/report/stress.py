@@ -1,0 +1,81 @@
+"""How a champion drives as its sensor, its actuators and its tyres get worse."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from cluster.report.pictures import drawable, figure_of, plain_style
+from cluster.store.champion import Champion, evaluate
+from gridsim.config import SimConfig
+
+PICTURE = "stress.png"
+
+
+class Stress(NamedTuple):
+    """One thing that gets worse: a number of a part of the configuration, at each level."""
+
+    label: str
+    part: str
+    name: str
+    levels: tuple[float, ...]
+    share: bool = False  # whether levels are shares of the champion's own number
+
+    def at(self, level: float, sim: SimConfig) -> SimConfig:
+        """A configuration with this one at a level."""
+        part = getattr(sim, self.part)
+        value = level * getattr(part, self.name) if self.share else level
+        return dataclasses.replace(sim, **{self.part: dataclasses.replace(part, **{self.name: value})})
+
+
+STRESSES = (
+    Stress("noise, m", "sensors", "noise", (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)),
+    Stress("dropout, share of readings", "sensors", "dropout", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)),
+    Stress("latency of readings, s", "sensors", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
+    Stress("latency of commands, s", "vehicle", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
+    Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
+)
+DYNAMIC = (
+    Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
+    Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
+)
+
+
+def stresses(champion: Champion) -> list[Stress]:
+    """What can get worse for a champion's vehicle."""
+    dynamic = champion.sim.vehicle.model != "kinematic"
+    return [each for each in STRESSES if not (dynamic and each.name == "lateral_grip")] + list(
+        DYNAMIC if dynamic else ()
+    )
+
+
+def drive(
+    champion: Champion, chosen: Iterable[Stress], scenario: str, episodes: int, seed: int, traffic: int
+) -> Iterator[tuple[Stress, float, dict[str, float]]]:
+    """Drive it at each level of each stress. Yields: the stress, the level, and the figures of `evaluate`."""
+    for stress in chosen:
+        for level in stress.levels:
+            worse = dataclasses.replace(champion, sim=stress.at(level, champion.sim))
+            yield stress, level, evaluate(worse, scenario, episodes, seed, traffic)
+
+
+@plain_style()
+def draw(found: Sequence[tuple[Stress, float, dict[str, float]]], title: str, path: Path) -> None:
+    """Draw success against each stress to a PNG."""
+    chosen = list(dict.fromkeys(stress for stress, _, _ in found))
+    figure, axes = figure_of(3.0 * len(chosen), 3.2, len(chosen))
+    for axis, stress in zip(axes, chosen, strict=True):
+        levels, shares = zip(
+            *((level, 100.0 * figures["success_rate"]) for each, level, figures in found if each == stress), strict=True
+        )
+        axis.plot(levels, shares, "o-", color="#0b7285")
+        axis.set(xlabel=stress.label, ylim=(-3.0, 103.0))
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+        if stress.share and stress.levels[-1] < 1.0:
+            axis.invert_xaxis()
+    axes[0].set_ylabel("success, %")
+    figure.suptitle(drawable(title), fontsize=10)
+    figure.savefig(path, dpi=100)
