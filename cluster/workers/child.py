@@ -9,9 +9,14 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-# This shell becomes the command. The one that it starts ends that when a pipe ends which only we hold open: if we close
-# it, and also if we are killed.
-_SHELL = 'exec 3<&0; (read _ <&3; kill -TERM $$) & exec "$@" 3<&- </dev/null'
+GRACE_S = 60  # from SIGTERM to SIGKILL: a run saves and ends in half of that, and Ray may never see the former
+# This shell becomes the command. The one that it starts ends that, and all in its session, when a pipe ends which only
+# we hold open: if we close it, and also if we are killed.
+_SHELL = """exec 3<&0; grace_s=$1; shift
+(read _ <&3; kill -TERM $$
+for _ in $(seq $grace_s); do sleep 1; kill -0 $$ || break; done
+kill -KILL -$$) 2>/dev/null &
+exec "$@" 3<&- </dev/null"""
 
 
 class Child:
@@ -20,7 +25,7 @@ class Child:
     def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None, log: Path | None = None):
         with open(log or os.devnull, "wb") as output:
             self._process = subprocess.Popen(
-                ["/bin/sh", "-c", _SHELL, "sh", *command], env=environment, start_new_session=True,
+                ["/bin/sh", "-c", _SHELL, "sh", str(GRACE_S), *command], env=environment, start_new_session=True,
                 stdin=subprocess.PIPE, stdout=output, stderr=output,
             )  # fmt: skip
 

@@ -85,6 +85,28 @@ def test_workers_that_cannot_start_end_the_run_in_one_line(monkeypatch: pytest.M
         pool.open()
 
 
+STUBBORN = """
+import time
+from cluster.workers import child
+
+child.GRACE_S = 1
+child.Child(["sh", "-c", "trap '' TERM; while :; do sleep 1; done"])
+print(flush=True)
+time.sleep(600)
+"""
+
+
+def test_what_does_not_end_by_itself_is_killed_if_the_coordinator_is(tmp_path: Path) -> None:
+    """Ray's head does not, if it waits for its own processes that have ended."""
+    (tmp_path / "own.py").write_text(STUBBORN)
+    with running("python", "own.py", cwd=tmp_path) as process:
+        process.stdout.readline()
+        wait_until(lambda: len(psutil.Process(process.pid).children(recursive=True)) == 3)
+        ours = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+    assert psutil.wait_procs(ours, timeout=10.0)[1] == [], "some are still there"
+
+
 SCRIPT = """
 import time
 from test_pool import Answering, make_recipes, make_task, never_built
