@@ -11,9 +11,9 @@ from cluster.workers.address import cluster_address
 from cluster.workers.open import open_pool
 from cluster.workers.pool import Outcome
 from cluster.workers.worker import Task
+from evolution.episodes import fitness
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.networks.policy import PolicySpec
-from evolution.search import fitness
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import gridsim
-from evolution.search import fitness
+from evolution.episodes import fitness
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.errors import GridSimError
 
