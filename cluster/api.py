@@ -20,7 +20,6 @@ from cluster.settings import DqnSettings, EvolveSettings, RunSettings, check_wor
 from cluster.store.champion import Champion, evaluate, load_champion
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
-from gridsim.config import SimConfig
 
 __all__ = ["Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn"]
 
@@ -92,7 +91,7 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
 def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
     settings.check()
     check_workers(workers, 0.0)
-    maps = Maps(settings.scenario, SimConfig())
+    maps = Maps(settings.scenario, settings.simulator())
     pool: WorkerPool | None = None
     try:
         pool = open_pool(workers, None, 0.0, maps.build)
