@@ -213,7 +213,7 @@ def test_a_champion_learns_validates_and_is_measured_with_its_own_car(own_sim, t
     own_sim.unlink()
     again = load_champion(tmp_path / "champion.npz")
     assert again.sim == champion.sim
-    chosen, roads = held_out(again, None, 8, 2_000_000, None)
+    chosen, _ = held_out(again, None, 8, 2_000_000, None)
     assert set(chosen.rows["target"]) == {30.0}
     assert again.make_env().unwrapped.cars.config == champion.sim
     assert evaluate(again, episodes=8, sim="default") != evaluate(again, episodes=8)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 from pictures import picture, save, write_yaml
@@ -11,6 +10,7 @@ from pictures import picture, save, write_yaml
 import gridsim
 from gridsim.car.vehicle import Action
 from gridsim.config import LIMITS, EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
+from gridsim.envs.env import GridSimEnv
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table
@@ -46,8 +46,7 @@ def test_a_file_gives_any_numbers_and_the_others_are_its_bases(tmp_path):
     vehicle = dataclasses.replace(base.vehicle, width=0.3, lateral_grip=math.inf)
     episode = dataclasses.replace(base.episode, patience=0.1)
     assert read == dataclasses.replace(base, vehicle=vehicle, episode=episode)
-    env = gymnasium.make("GridSim/Curved-v0", config=str(path))
-    assert env.unwrapped.cars.config == read
+    assert GridSimEnv(config=str(path)).cars.config == read
     path.write_text("sensors: {rays: 40}")
     assert SimConfig.load(path) == SimConfig(sensors=SensorConfig(rays=40))
 
@@ -104,7 +103,7 @@ def test_every_number_has_limits_and_a_unit(part, name):
         (SimConfig(traffic=TrafficConfig(spawn_gap_ego=5.0)), "traffic.spawn_gap_ego must be at least"),
         (SimConfig(episode=EpisodeConfig(time_limit=7e3)), "episode.time_limit must be 1 to 65,535 times"),
         (SimConfig(VehicleConfig(length=0.5)), "sensors.range must be at most 7.875 m for a car of 0.5 m"),
-        (SimConfig(sensors=SensorConfig(rays=31.0)), "sensors.rays must be a whole number"),
+        (SimConfig(sensors=SensorConfig(rays=31.0)), "sensors.rays must be a whole number"),  # type: ignore[arg-type]
     ],
 )
 def test_numbers_that_do_not_fit_each_other_are_refused(config, said):
@@ -180,7 +179,7 @@ def test_generated_roads_are_as_small_as_the_car_and_slower():
 
 
 def test_small_cars_have_no_traffic():
-    assert gymnasium.make("GridSim/City-v0", config="f1tenth").unwrapped.cars.simulator.worlds.shape[1] == 0
-    env = gymnasium.make("GridSim/City-v0", config="f1tenth", traffic=3)
+    assert GridSimEnv("city", config="f1tenth").cars.simulator.worlds.shape[1] == 0
+    env = GridSimEnv("city", config="f1tenth", traffic=3)
     with pytest.raises(GridSimError, match="traffic is for cars of"):
         env.reset(seed=0)
