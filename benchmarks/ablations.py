@@ -27,7 +27,6 @@ from evolution.search import recombination
 from evolution.search.base import Generation
 from evolution.search.breeding import Kind
 from evolution.search.recombination import Recombination
-from gridsim.config import SimConfig
 
 
 class FixedStepSize(Recombination):
@@ -111,10 +110,10 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     for constant, value in variant.constants.items():
         setattr(curriculum if hasattr(curriculum, constant) else recombination, constant, value)
     settings = EvolveSettings(scenario=scenario, traffic=traffic, seed=seed, **variant.settings)
-    maps = Maps(scenario, SimConfig())
+    maps = Maps(scenario, settings.simulator())
     learner = Evolution(settings, open_pool(0, None, 0.0, maps.build), maps)
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
-    learner.curriculum = Curriculum(config, seed, maps.get, settings.traffic)
+    learner.curriculum = Curriculum(config, seed, maps.get, maps.config, settings.traffic)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
     learner.search = variant.search(learner.search.space, search, seed)
     found = []

@@ -43,6 +43,7 @@ from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_
 from evolution.networks.symmetry import space
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
+from gridsim.config import constants
 from gridsim.jit import njit
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
@@ -81,11 +82,11 @@ def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 
 
 
 @njit
-def _actions(packed, layers, ranges, speeds, actions):
+def _actions(constants, packed, layers, ranges, speeds, actions):
     """The actions of one network in many cars."""
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
+        encode(constants, ranges[i], None, speeds[i], np.float32(0.0), scratch)
         actions[i] = decide(packed, layers, scratch)
 
 
@@ -101,7 +102,7 @@ def vector_env(
     env = gridsim.envs.env.GridSimVectorEnv(
         CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
     )
-    layers = PolicySpec.parse(champion.policy).layers
+    layers, k = PolicySpec.parse(champion.policy).layers, constants(champion.sim)
     packed = pack(champion.genome, layers)
     actions = np.zeros(CARS, dtype=np.int64)
     _, info = env.reset(seed=0)
@@ -113,7 +114,7 @@ def vector_env(
     for run in range(runs + 1):
         spent, driven = 0.0, 0
         for _ in range(steps):
-            _actions(packed, layers, env.simulator.ranges, info["speed_mps"], actions)
+            _actions(k, packed, layers, env.simulator.ranges, info["speed_mps"], actions)
             driven += CARS - int(over.sum())
             start = time.perf_counter()
             _, _, terminations, truncations, info = env.step(actions)

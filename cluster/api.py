@@ -27,7 +27,6 @@ from cluster.tracking.tracking import saved_uri
 from cluster.workers.address import cluster_address
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
-from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 
 __all__ = [
@@ -139,7 +138,7 @@ def _train(
     on_row = on_step or (lambda steps, row: None)
     if folder is not None:
         return _train_in(Path(folder), settings, Place(workers, cluster), on_row, resume, tracking_uri)
-    maps = Maps(settings.scenario, SimConfig())
+    maps = Maps(settings.scenario, settings.simulator())
     pool: WorkerPool | None = None
     try:
         pool = open_pool(workers, cluster, 0.0, maps.build)

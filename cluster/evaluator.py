@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from cluster.learn.maps import Maps
@@ -39,7 +41,7 @@ class Evaluator:
         scenario: str = "seamless",
         policy: str = "",
         traffic: int = -1,
-        sim: SimConfig | None = None,
+        sim: SimConfig | str = "default",
         workers: int = 0,
         address: str | None = None,
         episodes: int = 16,
@@ -50,19 +52,21 @@ class Evaluator:
             scenario: a road's name, or a map file.
             policy: the network, as for --policy of gridsim-evolve, whose default is this one's.
             traffic: other cars; -1 is as many as the road usually has.
-            sim: vehicle, sensors, episodes and traffic. A lower target and time limit make an evaluation shorter.
+            sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these. A lower target
+                and time limit make an evaluation shorter.
             workers, address: Ray workers, and a cluster's address; by default this process's threads.
             episodes: that each genome drives.
 
         Raises: GridSimError, a ValueError, in one line.
         """
         observation = PolicySpec.parse(policy).observation if policy else "rays"
-        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, observation=observation)
+        given: dict[str, Any] = {"sim": sim} if isinstance(sim, str) else {}
+        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, observation=observation, **given)
         settings.check()
         check_workers(workers, 0.0)
         if not 1 <= episodes <= MAX_EPISODES:
             raise GridSimError(f"episodes must be 1 to {MAX_EPISODES:,}, not {episodes}")
-        self._settings, self._sim, self._episodes = settings, sim or SimConfig(), episodes
+        self._settings, self._sim, self._episodes = settings, SimConfig.load(sim), episodes
         self.spec = PolicySpec.parse(settings.policy)
         self.genes: int = self.spec.size
         self._maps = Maps(scenario, self._sim)

@@ -36,7 +36,6 @@ from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VALIDATION_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
-from gridsim.config import SimConfig
 
 WAIT_FOR_MLFLOW_S = 30.0  # for the id of MLflow's run, which summary.json holds
 
@@ -69,7 +68,10 @@ def train(
     Raises: GridSimError, Stopped, and whatever else ends a run; the last whole step is saved.
     """
     started, settings = perf_counter() if started is None else started, run.settings
-    maps, tracking = Maps(settings.scenario, SimConfig()), Tracking(run.path, place.uri, place.experiment, read_run)
+    maps, tracking = (
+        Maps(settings.scenario, settings.simulator()),
+        Tracking(run.path, place.uri, place.experiment, read_run),
+    )
     pool: WorkerPool | None = None
     status: Status = "KILLED"
     try:
@@ -210,7 +212,7 @@ class Session:
         champion = Champion(best.genome, settings.policy, settings.scenario, sim, settings.traffic)
         champion.save(path / CHAMPION)
         champion.export_onnx(path / ONNX)
-        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic)
+        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic, sim)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
         self.on_event(next(driving))  # the workers drive, and meanwhile:
         write_report(self.run, champion, learning.history, write_elites(path, settings.policy), self.maps.get, episodes)

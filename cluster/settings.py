@@ -13,10 +13,14 @@ import tyro
 
 from cluster import fitness
 from evolution.episodes.curriculum import CurriculumConfig
+from evolution.episodes.rollout import policy_buffers
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
+from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
+from gridsim.step import parameters
+from gridsim.traffic.world import check_traffic
 
 MAX_TRAFFIC = 100
 MAX_STEPS = 10**15  # car-steps or episodes
@@ -41,6 +45,8 @@ class RunSettings(ABC):
     """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
+    sim: str = "default"
+    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"
@@ -58,10 +64,11 @@ class RunSettings(ABC):
     follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
-        if is_map_file(self.scenario):  # absolute: config.json may be read from another folder
-            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+        for name in ("scenario", "sim"):  # absolute: config.json may be read from another folder
+            if names_file(value := getattr(self, name)):
+                object.__setattr__(self, name, os.path.abspath(value))
         if self.traffic == -1:
-            object.__setattr__(self, "traffic", default_traffic(self.scenario))
+            object.__setattr__(self, "traffic", default_traffic(self.scenario, self.simulator()))
         for name, value in self.defaults().items():
             if not getattr(self, name):
                 object.__setattr__(self, name, value)
@@ -80,15 +87,26 @@ class RunSettings(ABC):
         """Its name in a comparison, which tells apart the two kinds of recombination."""
         return self.algorithm
 
+    def simulator(self) -> SimConfig:
+        """The simulator's numbers. Raises GridSimError."""
+        return SimConfig.load(self.sim)
+
     def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run: its paces suit the scenario, and traffic if there is any."""
-        low, _ = speed_interval(self.scenario)
-        pace, champion_pace = (low + 0.8, low + 0.3) if self.traffic else (low + 2.0, low + 0.85)
+        """The curriculum of such a run: it suits the scenario, the car's size, and traffic if there is any."""
+        sim, usual = self.simulator(), CurriculumConfig()
+        low, _ = speed_interval(self.scenario, sim)
+        above, champion_above = (0.8, 0.3) if self.traffic else (2.0, 0.85)
+        pace, champion_pace = low + above * sim.pace, low + champion_above * sim.pace
         if self.pace:
-            pace, champion_pace = self.pace + 1.15, self.pace
+            pace, champion_pace = self.pace + 1.15 * sim.pace, self.pace
         # In traffic, chance matters more: it takes more episodes to see how well a network drives.
         episodes = 3 if self.traffic else 1
-        return CurriculumConfig(pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes)
+        metres = {name: getattr(usual, name) * sim.unit for name in ("crash_target", "first_target", "last_target")}
+        rewind = max(round(usual.rewind * 0.1 * sim.pace / sim.episode.control_period), 1)  # of usual steps of 0.1 s
+        return replace(
+            usual, pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes, **metres,
+            rewind=rewind, slack=usual.slack * sim.pace,
+        )  # fmt: skip
 
     def extending(self, base: RunSettings) -> Self:
         """These settings for a run of `base` that is continued: its limits may be raised."""
@@ -102,21 +120,25 @@ class RunSettings(ABC):
         """Raises GridSimError, one line that says what to change."""
         _check_types(type(self), vars(self))
         check_name(self.scenario)
+        sim = self.simulator()
         if is_map_file(self.scenario):
-            build(self.scenario, 0)  # cached, so that it is read once
+            build(self.scenario, 0, sim)  # cached, so that it is read once
         self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and is_map_file(self.scenario):
             raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
+        check_traffic(self.traffic, sim)
         self._check_range(0, (1 << 63) - 1, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
-        low, high = speed_interval(self.scenario)
+        low, high = speed_interval(self.scenario, sim)
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
         spec = PolicySpec.parse(self.policy)
         if spec.observation != self.observation:
             remedy = f"give --observation {spec.observation}, or a policy such as {self.defaults()['policy']}"
             raise GridSimError(f"policy {self.policy} sees the {spec.observation}; {remedy}")
+        parameters(sim)  # raises for an unknown model of the vehicle
+        policy_buffers(spec, sim)  # raises for a sensor whose rays do not fit the network
 
     def _check_range(self, least: float, most: float, *names: str) -> None:
         for name in names:

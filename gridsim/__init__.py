@@ -12,6 +12,8 @@ from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
+from gridsim.config import SimConfig as SimConfig
+
 ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in ("highway", "curved", "seamless", "roundabout", "city")}
 """The scenario of each environment id."""
 

@@ -9,5 +9,6 @@ from cluster.api import evaluate as evaluate
 from cluster.api import evolve as evolve
 from cluster.api import load_champion as load_champion
 from cluster.api import train_dqn as train_dqn
+from gridsim.config import SimConfig as SimConfig
 
 ENVIRONMENTS: dict[str, str]

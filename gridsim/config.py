@@ -1,18 +1,28 @@
-"""The constants of the simulated world, each with its unit and its source."""
+"""The constants of the simulated world, each with its unit and its source, and the configuration of a run."""
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import math
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from gridsim.errors import GridSimError
+from gridsim.reading import number, read_yaml, shown
+
 _F = np.float32
 
-FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none
-SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
-REENTRY = _F(12.0)  # m driven; returning to a cell within this distance still counts as the same visit
+FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; see `SimConfig.file_speeds`
+# In units (`SimConfig.unit`), which are metres but for small cars.
+SUBSTEP = _F(1.0)  # a car moves between collision checks, at most
+REENTRY = _F(12.0)  # driven; returning to a cell within this distance still counts as the same visit
 
 # The reward of Trasnea et al. (2019).
 PROGRESS_SHARE = 0.15  # weight of the distance, and also of the speed
@@ -102,8 +112,8 @@ class EpisodeConfig:
     control_period: float = 0.1  # s
     target: float = 2000.0  # m of new ground: success
     time_limit: float = 400.0  # s
-    patience: int = 15  # control steps without progress that end an episode (the paper's sanity check)
-    progress: float = 0.05  # m of new ground; a step with less is without progress
+    patience: float = 1.5  # s without progress that end an episode (the paper's sanity check)
+    progress: float = 0.5  # m/s of new ground; a control step with less is without progress
     revisit: float = 200.0  # m of driving within which the same ground does not count again
 
     @property
@@ -135,6 +145,40 @@ class TrafficConfig:
     courtesy: float = 10.0  # m; waiting behind a standing car within this distance is not idleness
 
 
+# Limits of each number: least, greatest, unit.
+LIMITS: dict[str, dict[str, tuple[float, float, str]]] = {
+    "vehicle": {
+        "length": (0.2, 30.0, "m"), "width": (0.1, 5.0, "m"), "wheelbase": (0.1, 25.0, "m"),
+        "rear_axle": (0.05, 25.0, "m"), "steering_limit": (1.0, 80.0, "degrees"),
+        "steering_rate": (1.0, 1e5, "degrees/s"), "speed_limit": (0.5, 150.0, "m/s"),
+        "reverse_limit": (0.0, 50.0, "m/s"), "acceleration": (0.1, 50.0, "m/s2"), "braking": (0.1, 50.0, "m/s2"),
+        "lateral_grip": (0.1, math.inf, "m/s2"), "mass": (0.1, 1e5, "kg"), "yaw_inertia": (1e-4, 1e7, "kg m2"),
+        "mass_height": (0.001, 5.0, "m"), "friction": (0.05, 3.0, ""), "cornering_stiffness": (0.5, 200.0, "1/rad"),
+        "latency": (0.0, 2.0, "s"),
+    },
+    "sensors": {
+        "rays": (2, 256, ""), "field_of_view": (1.0, 240.0, "degrees"), "range": (1.0, 63.0, "m"),
+        "noise": (0.0, 10.0, "m"), "noise_share": (0.0, 1.0, ""), "dropout": (0.0, 1.0, ""),
+        "latency": (0.0, 2.0, "s"),
+    },
+    "episode": {
+        "control_period": (0.005, 1.0, "s"), "target": (0.1, 1e6, "m"), "time_limit": (0.1, 1e5, "s"),
+        "patience": (0.01, 1e6, "s"), "progress": (0.0, 100.0, "m/s"), "revisit": (0.0, 1e6, "m"),
+    },
+    "traffic": {
+        "acceleration": (1e-6, 50.0, "m/s2"), "comfort": (0.1, 50.0, "m/s2"), "braking": (1e-6, 50.0, "m/s2"),
+        "headway": (0.0, 100.0, "s"), "jam": (0.1, 100.0, "m"), "lateral": (0.1, 50.0, "m/s2"),
+        "politeness": (0.0, 10.0, ""), "threshold": (0.0, 50.0, "m/s2"), "safe_braking": (0.0, 50.0, "m/s2"),
+        "lane_change_speed": (0.1, 10.0, "m/s"), "verge": (0.0, 10.0, "m"), "give_way": (0.0, 10.0, "m"),
+        "taper": (0.001, 1.0, ""), "beside": (0.0, 10.0, "m"), "spawn_gap": (0.1, 1000.0, "m"),
+        "spawn_gap_ego": (0.1, 1000.0, "m"), "courtesy": (0.0, 1000.0, "m"),
+    },
+}  # fmt: skip
+MOST_STEPS = 65_535  # control steps of an episode
+LENGTH = 4.0  # m, of a car whose unit is 1 m
+LEAST_UNIT = 1 / 16  # m
+
+
 @dataclass(frozen=True)
 class SimConfig:
     """The simulator's parameters that do not depend on the scenario."""
@@ -155,6 +199,132 @@ class SimConfig:
         )
         values: dict[str, Any] = {name: float(rng.uniform(least, most)) for name, least, most in self.randomise}
         return replace(self, vehicle=replace(self.vehicle, **values), randomise=())
+
+    @classmethod
+    def load(cls, source: SimConfig | str | os.PathLike[str]) -> SimConfig:
+        """A preset by its name, or a YAML file with any of vehicle, sensors, episode and traffic; see docs/own.md.
+
+        What a file does not give is as in the preset that it names as its `base`, or else the default. A SimConfig is
+        returned as it is. Raises: GridSimError.
+        """
+        if isinstance(source, SimConfig):
+            return source
+        if not names_file(name := os.fspath(source)):
+            return _preset(name)
+        path = Path(name)
+        try:
+            return cls.of(read_yaml(path))
+        except GridSimError as error:
+            raise GridSimError(str(error) if str(error).startswith(name) else f"{path}: {error}") from None
+
+    @classmethod
+    def of(cls, values: Any) -> Self:
+        """A checked configuration from a mapping like that of a file. Raises: GridSimError."""
+        values = {} if values is None else values
+        if not isinstance(values, Mapping):
+            raise GridSimError(f"it is a mapping with {', '.join(LIMITS)}, not {shown(values)}")
+        _check_names("", values, [*LIMITS, "base", "randomise"])
+        base = _preset(str(values["base"])) if "base" in values else SimConfig()
+        parts = {}
+        for part, limits in LIMITS.items():
+            given = {} if values.get(part) is None else values[part]
+            if not isinstance(given, Mapping):
+                raise GridSimError(f"{part} is a mapping with {', '.join(limits)}, not {shown(given)}")
+            before = getattr(base, part)
+            _check_names(f"{part}.", given, [f.name for f in dataclasses.fields(before)])
+            words = {name: str(value) for name, value in given.items() if name not in limits}
+            numbers = {name: number(given[name], f"{part}.{name}", *limits[name]) for name in given if name in limits}
+            whole = {name: int(n) for name, n in numbers.items() if isinstance(limits[name][0], int) and n == int(n)}
+            parts[part] = dataclasses.replace(before, **words, **numbers | whole)
+        config = cls(**parts, randomise=_ranges(values.get("randomise") or {}) or base.randomise)
+        config.check()
+        return config
+
+    @cached_property
+    def unit(self) -> float:
+        """The unit (m) of what is made to measure for a car: 1, and for one of less than 2.8 m 1/2, 1/4, 1/8 or 1/16.
+
+        Maps are resolved, and roads built, as finely; by Froude's law, speeds are scaled with its square root.
+        """
+        return max(2.0 ** min(round(math.log2(self.vehicle.length / LENGTH)), 0), LEAST_UNIT)
+
+    @property
+    def pace(self) -> float:
+        """What speeds and times on a road that is scaled by `unit` are multiplied by."""
+        return math.sqrt(self.unit)
+
+    @property
+    def file_speeds(self) -> tuple[float, float]:
+        """The speed interval (m/s) of a map file that gives none."""
+        return FILE_SPEEDS[0] * self.pace, FILE_SPEEDS[1] * self.pace
+
+    def check(self) -> None:
+        """Raises: GridSimError for a number that is not one, is out of its limits, or does not fit the others."""
+        for part, limits in LIMITS.items():
+            for name, limit in limits.items():
+                value = getattr(getattr(self, part), name)
+                number(value, f"{part}.{name}", *limit)
+                if isinstance(limit[0], int) and not isinstance(value, (int, np.integer)):
+                    raise GridSimError(f"{part}.{name} must be a whole number, not {shown(value)}")
+        for name, *ends in self.randomise:
+            _check_names("randomise.", {name: ends}, list(LIMITS["vehicle"]))
+            least, most = (number(end, f"randomise.{name}", *LIMITS["vehicle"][name]) for end in ends)
+            if least > most:
+                raise GridSimError(f"randomise.{name} must be least and most, not {least:g} and {most:g}")
+            for end in ends:
+                changed: dict[str, Any] = {name: end}
+                replace(self, vehicle=replace(self.vehicle, **changed), randomise=()).check()
+        vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
+        if not vehicle.rear_axle < vehicle.wheelbase:
+            text = f"below vehicle.wheelbase, {vehicle.wheelbase:g} m: the centre of mass lies between the axles"
+            raise GridSimError(f"vehicle.rear_axle must be {text}, not {vehicle.rear_axle:g}")
+        reach = LIMITS["sensors"]["range"][1] * self.unit  # half the shortest side of a generated map
+        if self.sensors.range > reach:
+            text = f"at most {reach:g} m for a car of {vehicle.length:g} m"
+            raise GridSimError(f"sensors.range must be {text}, not {self.sensors.range:g}")
+        apart = vehicle.length + traffic.jam
+        for name in ("spawn_gap", "spawn_gap_ego"):
+            if getattr(traffic, name) < apart:
+                text = f"at least vehicle.length plus traffic.jam, {apart:g} m"
+                raise GridSimError(f"traffic.{name} must be {text}, not {getattr(traffic, name):g}")
+        if not 1 <= episode.steps <= MOST_STEPS:
+            text = f"1 to {MOST_STEPS:,} times episode.control_period, {episode.control_period:g} s"
+            raise GridSimError(f"episode.time_limit must be {text}, not {episode.time_limit:g}")
+
+
+def _ranges(given: Any) -> tuple[tuple[str, float, float], ...]:
+    """`SimConfig.randomise` from a mapping of names to [least, most], or from its own rows. Raises: GridSimError."""
+    try:
+        rows = [(name, *ends) for name, ends in given.items()] if isinstance(given, Mapping) else given
+        return tuple((str(name), float(least), float(most)) for name, least, most in rows)
+    except (TypeError, ValueError):
+        raise GridSimError(f"randomise is a mapping of names to [least, most], not {shown(given)}") from None
+
+
+def names_file(name: str) -> bool:
+    """Whether a name, of a scenario or a preset, is a file's path."""
+    return "." in name or os.sep in name
+
+
+def _check_names(where: str, given: Mapping[Any, Any], known: list[str]) -> None:
+    """Raises: GridSimError for a name that is not known, with the nearest one that is."""
+    for name in given:
+        if name not in known:
+            like = difflib.get_close_matches(str(name), known, 1)
+            remedy = f"did you mean {like[0]}?" if like else f"there are: {', '.join(known)}"
+            raise GridSimError(f"unknown key {where}{shown(name)[:60]}; {remedy}")
+
+
+@cache
+def _preset(name: str) -> SimConfig:
+    """A preset of this package. Raises: GridSimError."""
+    folder = Path(__file__).parent / "presets"
+    names = sorted(path.stem for path in folder.glob("*.yaml"))
+    if name not in names:
+        like = difflib.get_close_matches(name, names, 1)
+        remedy = f"did you mean {like[0]}?" if like else f"there are: {', '.join(names)}, and files (.yaml)"
+        raise GridSimError(f"unknown simulator {shown(name)}; {remedy}")
+    return SimConfig.of(read_yaml(folder / f"{name}.yaml"))
 
 
 class Constants(NamedTuple):
@@ -177,42 +347,20 @@ class Constants(NamedTuple):
     ray_range: np.float32  # m
     ray_first: np.float32  # rad, of the rightmost ray from the heading
     ray_step: np.float32  # rad
-    progress: np.float32  # m
+    progress: np.float32  # m in a control step
     revisit: np.float32  # m
     patience: np.int32  # steps
     courtesy: np.float32  # m
     contact: np.float32  # m between the middles of two cars, below which they may touch
     near: np.float32  # m from the car's middle, within which other cars matter to a control step
+    unit: np.float32  # m, of `SimConfig`
+    pace: np.float32  # of `SimConfig`
 
 
 def constants(config: SimConfig) -> Constants:
-    """Check a configuration and convert it for the kernels. Raises: ValueError if a value is invalid."""
+    """Check a configuration and convert it for the kernels. Raises: GridSimError if a value is invalid."""
+    config.check()
     vehicle, sensors, episode = config.vehicle, config.sensors, config.episode
-    for name, value in (
-        ("length", vehicle.length),
-        ("width", vehicle.width),
-        ("wheelbase", vehicle.wheelbase),
-        ("control_period", episode.control_period),
-        ("lateral_grip", vehicle.lateral_grip),
-        ("range", sensors.range),
-    ):
-        if not value > 0.0:
-            raise ValueError(f"{name} must be above 0, not {value}")
-    if sensors.rays < 2 or not 0.0 < sensors.field_of_view <= 240.0 or sensors.range > 63.0:
-        raise ValueError("the sensor needs 2 rays or more, a field of view within 240 degrees and a range within 63 m")
-    apart = vehicle.length + config.traffic.jam
-    if not min(config.traffic.spawn_gap, config.traffic.spawn_gap_ego) >= apart:
-        raise ValueError(f"spawn_gap and spawn_gap_ego must be at least a car's length plus jam, {apart:g} m")
-    for name, *ends in config.randomise:
-        if not isinstance(getattr(vehicle, name, ""), float):
-            raise ValueError(f"randomise: the vehicle has no number {name!r}")
-        if not ends[0] <= ends[1]:
-            raise ValueError(f"randomise: {name} must be least and most, not {ends[0]:g} and {ends[1]:g}")
-        for value in ends:
-            changed: dict[str, Any] = {name: value}
-            constants(replace(config, vehicle=replace(vehicle, **changed), randomise=()))
-    if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
-        raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)
     # Two cars approach each other by at most `approach` in a control step; within courtesy, waiting is not idleness.
     approach = 2.0 * vehicle.speed_limit * episode.control_period
@@ -236,10 +384,12 @@ def constants(config: SimConfig) -> Constants:
         ray_range=f(sensors.range),
         ray_first=f(-view / 2),
         ray_step=f(view / (sensors.rays - 1)),
-        progress=f(episode.progress),
+        progress=f(episode.progress * episode.control_period),
         revisit=f(episode.revisit),
-        patience=np.int32(episode.patience),
+        patience=np.int32(max(round(episode.patience / episode.control_period), 1)),
         courtesy=f(config.traffic.courtesy),
         contact=f(math.hypot(vehicle.length, vehicle.width) * 1.001),  # the factor is for rounding
         near=f(near),
+        unit=f(config.unit),
+        pace=f(config.pace),
     )

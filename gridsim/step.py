@@ -57,16 +57,18 @@ def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulati
 @njit
 def visit_cells(road: Road) -> int:
     """Number of visit cells of a map."""
-    return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+    columns, rows = int(road.width * road.per_m), int(road.height * road.per_m)
+    return columns // VISIT_CELL * (rows // VISIT_CELL)
 
 
 @leaf
 def visit_cell(road, x, y):
     """Index of the visit cell that contains a point of the torus."""
-    columns = I(road.width * _VISIT_SCALE)
-    rows = I(road.height * _VISIT_SCALE)
-    column = min(max(I(x * _VISIT_SCALE), I(0)), columns - I(1))
-    row = min(max(I(y * _VISIT_SCALE), I(0)), rows - I(1))
+    scale = _VISIT_SCALE * road.per_m
+    columns = I(road.width * scale)
+    rows = I(road.height * scale)
+    column = min(max(I(x * scale), I(0)), columns - I(1))
+    row = min(max(I(y * scale), I(0)), rows - I(1))
     return row * columns + column
 
 
@@ -133,7 +135,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         near = closing >= ZERO
         if near:
             fastest += closing
-    parts = I(1) + I(fastest * constants.dt / SUBSTEP)
+    parts = I(1) + I(fastest * constants.dt * road.per_m / SUBSTEP)
     dt = constants.dt / F(parts)
     moved = ZERO
     crashed = False
@@ -166,7 +168,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     if F(cell) != car[CELL]:
         gap = odometer - visits[cell]
         car[CELL] = F(cell)
-        if gap > REENTRY:
+        if gap > REENTRY * road.unit:
             car[FRESH] = ONE if gap > constants.revisit else ZERO
     visits[cell] = odometer
     gained = ZERO

@@ -272,7 +272,7 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, settings, path = session.summary, session.run.settings, session.run.path
     where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
-    console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
+    console.print(held_out_table(f"The champion on {where}", summary["held_out"], session.learning.sim.episode.target))
     steps, solved = count(summary[f"{settings.step_name}s"], settings.step_name), summary["solved"]
     reached = [name for name in settings.extendable if 0 < getattr(settings, name) <= summary[name]]
     longer = " ".join(f"{as_flag(name)} {2 * summary[name]}" for name in reached)
@@ -294,7 +294,7 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
 
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
-    champion = load_champion(flags.champion)
+    champion = load_champion(flags.champion).in_sim(flags.sim)
     road = flags.scenario or champion.scenario
     traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
     chosen = (road, flags.episodes, flags.seed, traffic)
@@ -311,7 +311,7 @@ def _evaluate() -> int:
         return 0
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
-    new_console().print(held_out_table(title, figures))
+    new_console().print(held_out_table(title, figures, champion.sim.episode.target))
     if missed is not None:
         new_console().print(errors_table("Errors against the reference driver", missed))
     if found:

@@ -86,6 +86,8 @@ class RoadFlags:
 
     scenario: Annotated[str, IN_WORDS] = ""
     """Road to drive on; by default the one it learned on."""
+    sim: Annotated[str, IN_WORDS] = ""
+    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file; by default those it learned with."""
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as it learned among, or as another road usually has."""
     seed: int = HELD_OUT_SEED

@@ -7,11 +7,11 @@ from rich.table import Column, Table
 from cluster.report.stress import Stress
 
 
-def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
-    """How well a champion drives on roads it never saw."""
+def held_out_table(title: str, figures: Mapping[str, float], target: float) -> Table:
+    """How well a champion drives on roads it never saw, where `target` m are success."""
     table = Table("", Column(justify="right"), title=title, title_justify="left", show_header=False)
     table.add_row("episodes", f"{figures['episodes']:.0f}")
-    table.add_row("success (2,000 m without a collision)", f"{figures['success_rate']:.1%}")
+    table.add_row(f"success ({target:,g} m without a collision)", f"{figures['success_rate']:.1%}")
     table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")

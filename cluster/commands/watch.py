@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
+import os
 import re
 import sys
 import time
@@ -28,7 +29,7 @@ from cluster.store.champion import Champion, UnfinishedError, load_champion
 from cluster.store.checkpoint import CHAMPION, CheckpointError
 from cluster.store.folder import CHECKPOINT, CONFIG, RunError, read_config
 from cluster.store.steps import read_elites
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
@@ -80,13 +81,15 @@ class WatchFlags(RoadFlags):
 class DriveFlags:
     """Drive yourself, with the arrow keys: up accelerates, down brakes (and reverses once the car stands).
 
-    Space brakes, R restarts, Esc or Q ends. A recorded drive is a plain CSV file, a row for each control step of 0.1 s:
+    Space brakes, R restarts, Esc or Q ends. A recorded drive is a plain CSV file, a row for each control step:
     time, pose, speed, steering, action, and the map; gridsim-watch shows it again.
     """
 
     example: ClassVar[str] = "gridsim-drive --scenario city --record drive.csv"
     scenario: str = "seamless"
     """Road to drive on: highway, curved, seamless, roundabout, city, or a map file."""
+    sim: str = "default"
+    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as it usually has."""
     record: Annotated[str, IN_WORDS] = ""
@@ -170,7 +173,7 @@ def _elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     number = len(genomes) - 1 if generation is None else generation
     if not 0 <= number < len(genomes):
         raise GridSimError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
-    champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
+    champion = Champion(genomes[number], settings.policy, settings.scenario, settings.simulator(), settings.traffic)
     return champion, f"elite of {step} {number}"
 
 
@@ -190,6 +193,7 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
     for seed in itertools.count(flags.seed) if not flags.output else (flags.seed,):
         elite = flags.follow or flags.generation is not None
         champion, name = _elite(source, flags.generation) if elite else (load_champion(source), "champion")
+        champion = champion.in_sim(flags.sim)
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
         traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
@@ -199,16 +203,16 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     """The episodes of a recorded drive."""
-    if flags.generation is not None or flags.follow or flags.scenario or flags.traffic != -1:
-        raise GridSimError(
-            "a recorded drive has its own driver and road; leave out --generation, --follow, --scenario and --traffic"
-        )
-    recorded, config = read_drive(flags.source), SimConfig()
+    if flags.generation is not None or flags.follow or flags.scenario or flags.sim or flags.traffic != -1:
+        own = "a recorded drive has its own driver, car and road"
+        raise GridSimError(f"{own}; leave out --generation, --follow, --scenario, --sim and --traffic")
+    recorded = read_drive(flags.source)
+    config = SimConfig.load(recorded.sim)
     scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
     _, cars, ranges, worlds = replay(recorded, scenario)
     for episode in range(int(recorded.episodes[-1]) + 1):
-        own, period = recorded.episodes == episode, config.episode.control_period
-        drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, period)
+        own = recorded.episodes == episode
+        drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, config)
         yield drive, f"episode {episode + 1}"
 
 
@@ -232,8 +236,10 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
+    if len({each.drive.sim.vehicle for each in shown}) > 1:
+        raise GridSimError("a page shows one kind of car; give --sim")
     title = f"GridSim: {', '.join(sources)} on {shown[0].drive.scenario.name}"
-    write_page(output, title, shown, SimConfig(), together=bool(flags.beside))
+    write_page(output, title, shown, together=bool(flags.beside))
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
@@ -248,7 +254,7 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
     drives = list(_drives(flags, limit))
     seconds = min(limit, sum(each.seconds for each, _ in drives))
     total = max(1, round(seconds * fps))
-    renderer = Renderer(drives[0][0].scenario, size)
+    renderer = Renderer(drives[0][0].scenario, size, drives[0][0].sim)
     pictures = (each for drive, name in drives for each in frames(renderer, drive, fps, _title(drive, name)))
     console, doing = new_console(), f"filming {seconds:.0f} s of driving"
     shown = track(itertools.islice(pictures, total), doing, total, console=console, transient=True)
@@ -262,12 +268,12 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
 def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     """Show drives in a window until it is closed."""
     fps = flags.fps or 30
-    drives = _drives(flags, FOLLOW_S if flags.follow else SimConfig().episode.time_limit)
+    drives = _drives(flags, FOLLOW_S if flags.follow else math.inf)
     first = next(drives)  # raises errors before the window opens
     shown = 0.0
     with contextlib.closing(_Window(size, f"GridSim: {flags.source}")) as window:
         for each, name in itertools.chain([first], drives):
-            renderer, title = Renderer(each.scenario, size), _title(each, name)
+            renderer, title = Renderer(each.scenario, size, each.sim), _title(each, name)
             for k in range(round((each.seconds + LINGER_S) * fps) + 1):
                 window.show(picture(renderer, each, k / fps, title), fps)
                 shown += 1 / fps
@@ -282,12 +288,14 @@ def _drive() -> int:
     flags = parse(DriveFlags, DRIVE, sys.argv[1:])
     stopping.listen()
     size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
-    scenario, start = _map(flags.scenario, flags.seed, SimConfig())
-    traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
+    sim = os.path.abspath(flags.sim) if names_file(flags.sim) else flags.sim
+    config = SimConfig.load(sim)
+    scenario, start = _map(flags.scenario, flags.seed, config)
+    traffic = default_traffic(flags.scenario, config) if flags.traffic == -1 else flags.traffic
     with contextlib.closing(_Window(size, f"GridSim: {flags.scenario}")) as window:
-        recorder = Recorder(flags.record, scenario, traffic) if flags.record else None
+        recorder = Recorder(flags.record, scenario, traffic, sim) if flags.record else None
         try:
-            done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
+            done = drive(scenario, start, window, Renderer(scenario, size, config), recorder, seconds, traffic)
             print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
         finally:  # also if the drive is interrupted
             if recorder is not None:

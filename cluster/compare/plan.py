@@ -24,6 +24,7 @@ from cluster.store.checkpoint import SUMMARY
 from cluster.store.folder import RunFolder
 from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
+from gridsim.config import names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file, label
 
@@ -35,7 +36,7 @@ SECONDS = {"s": 1, "min": 60, "h": 3600}
 EVALUATIONS = 10  # of the DQN, at least
 # Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
 PLANNED = (
-    "scenario", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
+    "scenario", "sim", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
     "evaluate_every",
 )  # fmt: skip
 
@@ -55,6 +56,8 @@ class Plan:
     budget: str = "60s"
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
+    sim: str = "default"
+    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as each road usually has."""
     population: Annotated[int, IN_WORDS] = 0
@@ -68,6 +71,8 @@ class Plan:
     def __post_init__(self) -> None:
         absolute = tuple(os.path.abspath(name) if is_map_file(name) else name for name in self.scenarios)
         object.__setattr__(self, "scenarios", absolute)
+        if names_file(self.sim):
+            object.__setattr__(self, "sim", os.path.abspath(self.sim))
 
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
@@ -115,6 +120,7 @@ class Plan:
         car_steps, _ = limits(self.budget)
         common: dict[str, Any] = {
             "scenario": scenario,
+            "sim": self.sim,
             "traffic": self.traffic,
             "seed": seed,
             "observation": self.observation,

@@ -81,9 +81,9 @@ class Learning(ABC):
 
     def __post_init__(self) -> None:
         s = self.settings
-        self.sim = SimConfig()
+        self.sim = self.maps.config  # what a whole run is simulated with
         self.spec = PolicySpec.parse(s.policy)
-        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, s.traffic)
+        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim, s.traffic)
 
     @abstractmethod
     def step(self) -> Progress:

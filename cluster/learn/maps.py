@@ -14,7 +14,7 @@ class Maps:
     """The maps of one scenario, by their seeds, built by a thread until they are asked for."""
 
     def __init__(self, scenario: str, config: SimConfig):
-        self._scenario, self._config = scenario, config
+        self._scenario, self.config = scenario, config
         self._built: dict[int, Future[Map]] = {}
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
 
@@ -22,14 +22,14 @@ class Maps:
         """Begin to build maps that will be needed, in this order, after those that were named before."""
         for seed in seeds:
             if seed not in self._built:
-                self._built[seed] = self._thread.submit(build, self._scenario, seed, self._config)
+                self._built[seed] = self._thread.submit(build, self._scenario, seed, self.config)
 
     def get(self, seed: int) -> Map:
         """The map of a seed. One that is still in the queue is built by the caller."""
         future = self._built.get(seed)
         if future is None or future.cancel():
             future = self._built[seed] = Future()
-            future.set_result(build(self._scenario, seed, self._config))
+            future.set_result(build(self._scenario, seed, self.config))
         return future.result()
 
     def build(self, scenario: str, seed: int) -> Map:

@@ -18,6 +18,7 @@ from cluster.store.champion import Champion
 from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
+from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.simulator import views
 from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End, X, Y
@@ -42,8 +43,13 @@ class Recording:
     ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how it ended; RUNNING if only the recording did
-    period: float  # s from state to state
+    sim: SimConfig  # with which it was driven
     outputs: np.ndarray | None = None  # float32 [steps + 1, 8], the network's for each action, if they are known
+
+    @property
+    def period(self) -> float:
+        """Seconds from state to state."""
+        return self.sim.episode.control_period
 
     @property
     def seconds(self) -> float:
@@ -68,8 +74,8 @@ def record(
     ranges, closing = views(scenario, cars, worlds, champion.sim)
     outputs = None
     if isinstance(spec, MlpSpec):
-        outputs = outputs_of(spec, champion.genome, ranges, closing, cars[:, SPEED], cars[:, STEERING])
-    return Recording(scenario, cars, ranges, other_cars(worlds), end, episode.control_period, outputs)
+        outputs = outputs_of(spec, champion.genome, ranges, closing, cars[:, SPEED], cars[:, STEERING], champion.sim)
+    return Recording(scenario, cars, ranges, other_cars(worlds), end, champion.sim, outputs)
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:

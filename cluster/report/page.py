@@ -2,7 +2,7 @@
 
 Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel;
 the differences between moments are compressed. Positions are in 65,536ths of the map's sides and headings in
-65,536ths of a turn, so that both wrap as the torus and the angle do.
+65,536ths of a turn, so that both wrap as the torus and the angle do. Lengths are in units (`SimConfig.unit`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cluster.report.film import Recording
 from cluster.report.pictures import bounds, plain_style
 from cluster.store.checkpoint import write_atomic
 from gridsim.car.vehicle import Action
-from gridsim.config import SimConfig, constants
+from gridsim.config import constants
 from gridsim.jit import freeze
 from gridsim.maps.map import Map
 from gridsim.maps.roads import clearances
@@ -62,7 +62,7 @@ class Shown:
         rays = outputs = 0
         if self.stride == 1:
             rays = drive.ranges.shape[1]
-            channels += [ray * 100.0 for ray in drive.ranges.T]
+            channels += [ray * 100.0 / float(road.unit) for ray in drive.ranges.T]
             if drive.outputs is not None:
                 outputs = drive.outputs.shape[1]
                 low, high = drive.outputs.min(axis=1, keepdims=True), drive.outputs.max(axis=1, keepdims=True)
@@ -87,12 +87,13 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
     return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
 
 
-def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig, together: bool = False) -> None:
+def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = False) -> None:
     """Write a page of drives on one map. It begins with the last of them, or shows all of them `together`.
 
     Raises: WriteError.
     """
-    road_map, constant = shown[-1].drive.scenario, constants(config)
+    last = shown[-1].drive
+    road_map, constant, unit = last.scenario.magnified(), constants(last.sim), last.sim.unit
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
     data = {
         "title": title,
@@ -102,8 +103,8 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig
         "view": bounds(road_map),
         "interval": [float(road_map.road.speed_low), float(road_map.road.speed_high)],
         "fastest": 1.2 * float(road_map.road.speed_high),
-        "car": [config.vehicle.length, config.vehicle.width],
-        "sensor": float(constant.front_axle),
+        "car": [last.sim.vehicle.length / unit, last.sim.vehicle.width / unit],
+        "sensor": float(constant.front_axle) / unit,
         "fan": [float(constant.ray_first), float(constant.ray_step)],
         "actions": [action.name.lower().replace("_", " ") for action in Action],
         # Centre x, y (m) and half of the dash dx, dy (m).

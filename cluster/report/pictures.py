@@ -95,7 +95,8 @@ def bounds(road_map: Map) -> list[float]:
         return [0.0, width, 0.0, height]
     nodes = node_clearance(road_map.road)
     y, x = np.nonzero(nodes > 0.0)
-    return (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width + [-5.0, 5.0, -5.0, 5.0]).tolist()
+    margin = 5.0 * float(road_map.road.unit) * np.array([-1.0, 1.0, -1.0, 1.0])
+    return (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width + margin).tolist()
 
 
 @plain_style()

@@ -44,4 +44,4 @@ def write_report(
         elite = dataclasses.replace(champion, genome=elites[k])
         drive = film.record(elite, road_map, start, limit, episodes.worlds[0])
         shown.insert(0, page.Shown(f"elite of {settings.step_name} {k}", str(k), drive, stride=2))
-    page.write_page(path / PAGE, f"GridSim: {run.name}, {title}", shown, champion.sim)
+    page.write_page(path / PAGE, f"GridSim: {run.name}, {title}", shown)

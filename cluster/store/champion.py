@@ -23,12 +23,13 @@ from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
 from evolution.networks.export import to_onnx
 from evolution.networks.policy import CnnSpec, PolicySpec, act_on
-from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
+from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, build, default_traffic
 
-GONE = ("apart", "kerb")  # former parameters of traffic, which older champions hold
+SIM_FORMAT = 2  # of a champion's `sim`; in the first one, patience and progress were per control step
+GONE = ("apart", "kerb")  # former parameters of traffic, which champions of the first format may hold
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,17 @@ class Champion:
         """Digest of the genome's bytes."""
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
 
+    def in_sim(self, sim: SimConfig | str | None) -> Champion:
+        """The champion in another car or with other sensors, if given (`SimConfig.load`). Raises GridSimError."""
+        other = dataclasses.replace(self, sim=SimConfig.load(sim)) if sim else self
+        rollout.policy_buffers(PolicySpec.parse(self.policy), other.sim)  # raises if the rays do not fit the network
+        return other
+
     def traffic_on(self, scenario: str) -> int:
         """Other cars on a scenario by default: on its own as many as it learned among, elsewhere the usual number."""
-        return self.traffic if scenario == self.scenario else default_traffic(scenario)
+        if scenario == self.scenario and self.sim.unit == 1.0:
+            return self.traffic
+        return default_traffic(scenario, self.sim)
 
     def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> int | np.ndarray:
         """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
@@ -78,13 +87,15 @@ class Champion:
         scenario = scenario or self.scenario
         spec = PolicySpec.parse(self.policy)
         own: dict[str, Any] = {"observation": spec.observation, "traffic": self.traffic_on(scenario)}
+        own["config"] = self.sim
         own |= {name: value for name, value in vars(spec).items() if name in ("motion", "steering", "frames")}
-        return GridSimEnv(scenario=scenario, config=self.sim, **own | options)
+        return GridSimEnv(scenario=scenario, **own | options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if it cannot be written."""
         meta = {name: getattr(self, name) for name in ("policy", "scenario", "traffic")}
-        checkpoint.save(path, {"genome": self.genome}, meta | {"sim": dataclasses.asdict(self.sim)})
+        sim = {"sim": dataclasses.asdict(self.sim), "sim_format": SIM_FORMAT}
+        checkpoint.save(path, {"genome": self.genome}, meta | sim)
 
     def export_onnx(self, path: str | os.PathLike[str]) -> None:
         """Write an ONNX file from the environment's observations to actions (docs/deploy.md).
@@ -118,18 +129,20 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
             raise ValueError(f"its genome does not fit {spec}")
         if not np.isfinite(genome).all():
             raise ValueError("some of its genes are not numbers")
-        config = SimConfig(
-            VehicleConfig(**sim["vehicle"]),
-            SensorConfig(**sim["sensors"]),
-            EpisodeConfig(**sim["episode"]),
-            TrafficConfig(**{k: v for k, v in sim.get("traffic", {}).items() if k not in GONE}),
-        )
-        constants(config)  # which checks it
-        if not 1 <= config.episode.steps <= rollout.MAX_STEPS:
-            raise ValueError(f"an episode has 1 to {rollout.MAX_STEPS} steps, not {config.episode.steps}")
+        if meta.get("sim_format", 1) == 1:
+            sim = _in_seconds(sim)
+        config = SimConfig.of(sim)
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
+
+
+def _in_seconds(sim: dict[str, Any]) -> dict[str, Any]:
+    """A champion's `sim` of the first format as it is now."""
+    episode, period = sim["episode"], sim["episode"]["control_period"]
+    episode = episode | {"patience": episode["patience"] * period, "progress": episode["progress"] / period}
+    traffic = {name: value for name, value in sim.get("traffic", {}).items() if name not in GONE}
+    return sim | {"episode": episode, "traffic": traffic}
 
 
 def _missing(run: Path) -> CheckpointError:
@@ -149,15 +162,18 @@ def evaluate(
     episodes: int = 64,
     seed: int = HELD_OUT_SEED,
     traffic: int | None = None,
+    sim: SimConfig | str | None = None,
 ) -> dict[str, float]:
     """Drive a champion through episodes on maps it never saw, in this process.
 
     Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed; other cars on the
-    road (default: as many as it learned among, or as the other scenario has by default).
+    road (default: as many as it learned among, or as the other scenario has by default); what `SimConfig.load` takes,
+    in place of the simulator's numbers that it learned with.
     Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
     held-out figures of summary.json.
     Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.
     """
+    champion = champion.in_sim(sim)
     chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
     spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
     results = rollout.evaluate(spec, genomes, roads, chosen.rows, sim, chosen.worlds)[0]

@@ -62,7 +62,7 @@ class RunFolder:
             "gridsim": version("gridsim"),
             "settings": dataclasses.asdict(self.settings),
             "curriculum": dataclasses.asdict(self.settings.curriculum()),
-            "simulator": dataclasses.asdict(SimConfig()),
+            "simulator": dataclasses.asdict(self.settings.simulator()),
             "init": self.init,
             "init_sha256": self.init_sha256,
             **_sources(self.settings),
@@ -91,6 +91,8 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         settings = from_dict(SETTINGS[config["command"]], config["settings"])
         if config.get("map_sha256") != _sources(settings).get("map_sha256"):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
+        if "sim" in config["settings"] and SimConfig.of(config["simulator"]) != settings.simulator():
+            raise RunError(f"--sim {settings.sim} is not what it was for {path}; put it back, or start a new run")
         return settings, str(config.get("init", ""))
     except RunError:
         raise

@@ -1,9 +1,9 @@
 """Compiling the kernels that a run needs, before it needs them: once for all processes, and on more than one core.
 
 Numba compiles one function at a time in a process. So separate processes compile what is missing in the cache on disk
-(`gridsim.jit`), from which all others then load it: `python -m cluster.workers.kernels PART SCENARIO POLICY TRAFFIC
-COMMAND`, with a part of `PARTS`. `python -m cluster.workers.kernels everything` compiles what the learners need by
-default on all roads, for an image that is to be started often.
+(`gridsim.jit`), from which all others then load it: `python -m cluster.workers.kernels PART SCENARIO SIM POLICY
+TRAFFIC COMMAND`, with a part of `PARTS`. `python -m cluster.workers.kernels everything` compiles what the learners need
+by default on all roads, for an image that is to be started often.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def is_compiled(settings: RunSettings) -> bool:
 
 def compile_ahead(settings: RunSettings) -> None:
     """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
-    what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
+    what = [settings.scenario, settings.sim, settings.policy, str(settings.traffic), settings.command]
     compilers = list[Child]()
     try:
         for part in PARTS:  # -P: not from this folder
@@ -70,9 +70,9 @@ def compile_ahead(settings: RunSettings) -> None:
             compiler.close(0.0)
 
 
-def compile_part(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
+def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, command: str) -> None:
     """Compile one of PARTS in this process, or load it from the cache, by the smallest drive: one step, on no road."""
-    config, spec, road = SimConfig(), PolicySpec.parse(policy), blank()
+    config, spec, road = SimConfig.load(sim), PolicySpec.parse(policy), blank()
     genome, keys = np.zeros(spec.size, dtype=np.float32), np.zeros(1, dtype=np.uint64)
     episodes = np.zeros(1, dtype=EPISODE)
     episodes["target"] = episodes["steps"] = 1
@@ -86,7 +86,7 @@ def compile_part(part: str, scenario: str, policy: str, traffic: int, command: s
                 CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
             )
         return
-    built = build(scenario, 0)
+    built = build(scenario, 0, config)
     spawn(built.network, sample_starts(built, 1, np.random.default_rng(0)), traffic, keys, config)
     _, cars, others = trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
     views(road, cars, others, config)
@@ -107,12 +107,12 @@ def everything_by_default() -> list[RunSettings]:
 def main(part: str, *what: str) -> None:
     """Compile one part, or everything, in this process."""
     if part != "everything":
-        scenario, policy, traffic, command = what
-        compile_part(part, scenario, policy, int(traffic), command)
+        scenario, sim, policy, traffic, command = what
+        compile_part(part, scenario, sim, policy, int(traffic), command)
         return
     for settings in everything_by_default():
         for each in PARTS:
-            compile_part(each, settings.scenario, settings.policy, settings.traffic, settings.command)
+            compile_part(each, settings.scenario, settings.sim, settings.policy, settings.traffic, settings.command)
         _marker(settings).touch()
         print(_marker(settings).name, flush=True)
 

@@ -59,7 +59,7 @@ class CurriculumConfig:
 
 
 def spread_starts(
-    build: Callable[[int], Map], seeds: range, episodes: int, traffic: int = 0, config: SimConfig | None = None
+    build: Callable[[int], Map], seeds: range, episodes: int, traffic: int, config: SimConfig
 ) -> Episodes:
     """Full episodes on the maps of `seeds` in turn; they depend only on the scenario and the arguments."""
     rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
@@ -70,13 +70,14 @@ def spread_starts(
 class Curriculum:
     """The curriculum of one run: its target, crashes, training maps and validation."""
 
-    def __init__(self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], traffic: int = 0):
-        self.config, self.seed, self.build = config, seed, build
+    def __init__(
+        self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], sim: SimConfig, traffic: int = 0
+    ):
+        self.config, self.seed, self.build, self.sim = config, seed, build, sim
         self.traffic, self.crowd = traffic, round(config.crowd * traffic)
-        episode = SimConfig().episode
-        self.goal, self.period = episode.target, episode.control_period
+        self.goal, self.period = sim.episode.target, sim.episode.control_period
         self.target = min(config.first_target, self.goal)
-        self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
+        self.crashes, self.crash_worlds = self._starts([], np.zeros(0, dtype=int), np.random.default_rng(0))
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: dict[range, Episodes] = {}
         rng, seeds = np.random.default_rng(np.random.SeedSequence([seed, 11])), VALIDATION_SEED - TRAINING_SEED
@@ -84,6 +85,12 @@ class Curriculum:
 
     def _rng(self, generation: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
+
+    def _starts(
+        self, seeds: Sequence[int], maps: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Episodes and their traffic, of training, on maps [e] that index `seeds`."""
+        return lane_starts([self.build(seed) for seed in seeds], maps, rng, self.crowd, self.sim)
 
     def maps_in_use(self, generation: int) -> int:
         """Number of training maps in use."""
@@ -103,7 +110,7 @@ class Curriculum:
         """Episodes with new starts on training maps [e]."""
         used, local = np.unique(maps, return_inverse=True)
         seeds = [self.map_seeds[m] for m in used]
-        return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
+        return Episodes(seeds, *self._starts(seeds, local, rng))
 
     def episodes(self, generation: int) -> Episodes:
         """A generation's episodes, group by group: first new starts, then crash starts, as many in each group."""
@@ -185,7 +192,7 @@ class Curriculum:
         They share a task with a generation's episodes, so their worlds are padded with absent cars to the same size.
         """
         if seeds not in self._validation:
-            maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic)
+            maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic, self.sim)
             absent = np.zeros((len(rows), self.crowd - self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
             self._validation[seeds] = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))

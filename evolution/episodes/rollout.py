@@ -16,7 +16,7 @@ from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
-from gridsim.config import SimConfig
+from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
 from gridsim.jit import ZERO, F, I, U, freeze, leaf, njit
@@ -35,8 +35,6 @@ EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("st
 
 #: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
-
-MAX_STEPS = 65_535
 
 
 class GridBuffers(NamedTuple):
@@ -127,7 +125,7 @@ def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
     look(simulation, car, world, workspace.ranges, closing, workspace.history)
     if grid_buffers is None:
-        encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
+        encode(simulation.constants, workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:
         fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
 
@@ -260,9 +258,9 @@ def _collect(
 
 
 def _check_steps(episodes: np.ndarray) -> None:
-    wrong = episodes["steps"][(episodes["steps"] < 1) | (episodes["steps"] > MAX_STEPS)]
+    wrong = episodes["steps"][(episodes["steps"] < 1) | (episodes["steps"] > MOST_STEPS)]
     if len(wrong):
-        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {wrong[0]}")
+        raise ValueError(f"an episode has 1 to {MOST_STEPS} steps, not {wrong[0]}")
 
 
 def evaluate(

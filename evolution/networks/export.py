@@ -131,8 +131,8 @@ def _add_mlp(graph: _Graph, spec: MlpSpec, genome: np.ndarray, config: SimConfig
     columns = graph.constant([RAYS, spec.inputs - RAYS], np.int64)
     graph.nodes.append(("Split", ("observation", columns), (ranges, rest), {"axis": 1}))
     ranges = graph.add("Mul", ranges, graph.constant(config.sensors.range))
-    near = graph.add("Div", ranges, graph.add("Add", ranges, graph.constant(RAY_HALF)))
-    speed = config.vehicle.speed_limit / float(SPEED_SCALE)
+    near = graph.add("Div", ranges, graph.add("Add", ranges, graph.constant(float(RAY_HALF) * config.unit)))
+    speed = config.vehicle.speed_limit / (float(SPEED_SCALE) * config.pace)
     scales, shifts = [speed] * RAYS * spec.motion + [speed], [0.0] * RAYS * spec.motion + [-1.0]
     if spec.steering:
         scales.append(math.radians(config.vehicle.steering_limit) / float(STEERING_SCALE))

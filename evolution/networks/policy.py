@@ -17,7 +17,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from evolution.networks.dense import tile
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import F, U, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
@@ -26,8 +26,8 @@ RAYS = 31
 INPUTS = RAYS + 1  # the rays and the speed
 ACTIONS = 8
 MAX_GENES = 1_000_000
-RAY_HALF = F(8.0)  # m, the range that is encoded as 0
-SPEED_SCALE = F(10.0)  # m/s, the speed that is encoded as 0
+RAY_HALF = F(8.0)  # the range that is encoded as 0, in units (`SimConfig.unit`), which are m but for small cars
+SPEED_SCALE = F(10.0)  # m/s, the speed that is encoded as 0; for a perceptron of a small car less (`SimConfig.pace`)
 STEERING_SCALE = F(0.5)  # rad, the steering angle that is encoded as 1
 
 
@@ -187,21 +187,22 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
 
 @leaf
-def encode(ranges, closing, speed, steering, inputs):
+def encode(constants, ranges, closing, speed, steering, inputs):
     """Write the network's inputs: float32 [rays + 2], or [2 * rays + 2] if closing is not None.
 
-    Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed and the steering
-    angle (rad) follow; a network without `+steering` has one input fewer and does not read the angle.
+    Ranges r (m; of small cars in their unit) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds,
+    the speed and the steering angle (rad) follow; a network without `+steering` has one input fewer and does not read
+    the angle.
     """
-    rays = ranges.shape[0]
+    rays, half, scale = ranges.shape[0], RAY_HALF * constants.unit, SPEED_SCALE * constants.pace
     for i in range(rays):
-        inputs[i] = F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - F(1.0)
+        inputs[i] = F(2.0) * ranges[i] / (ranges[i] + half) - F(1.0)
     last = rays
     if closing is not None:
         for i in range(rays):
-            inputs[rays + i] = closing[i] / SPEED_SCALE
+            inputs[rays + i] = closing[i] / scale
         last = 2 * rays
-    inputs[last] = speed / SPEED_SCALE - F(1.0)
+    inputs[last] = speed / scale - F(1.0)
     inputs[last + 1] = steering / STEERING_SCALE
 
 
@@ -316,16 +317,22 @@ def decide(packed, layers, scratch):
 
 
 @njit
-def _outputs(packed, layers, ranges, closing, speeds, angles, outputs):
+def _outputs(constants, packed, layers, ranges, closing, speeds, angles, outputs):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for n in range(ranges.shape[0]):
-        encode(ranges[n], None if closing is None else closing[n], speeds[n], angles[n], scratch)
+        encode(constants, ranges[n], None if closing is None else closing[n], speeds[n], angles[n], scratch)
         first = forward(packed, layers, scratch)
         outputs[n] = scratch[first : first + outputs.shape[1]]
 
 
 def outputs_of(
-    spec: MlpSpec, genome: np.ndarray, ranges: np.ndarray, closing: np.ndarray, speeds: np.ndarray, angles: np.ndarray
+    spec: MlpSpec,
+    genome: np.ndarray,
+    ranges: np.ndarray,
+    closing: np.ndarray,
+    speeds: np.ndarray,
+    angles: np.ndarray,
+    config: SimConfig,
 ) -> np.ndarray:
     """Outputs float32 [n, 8] of a perceptron, one for each action.
 
@@ -334,7 +341,8 @@ def outputs_of(
     """
     outputs = np.empty((len(ranges), spec.outputs), dtype=np.float32)
     packed = pack(np.ascontiguousarray(genome), spec.layers)
-    _outputs(packed, spec.layers, ranges, closing if spec.motion else None, speeds, angles, outputs)
+    seen = ranges, closing if spec.motion else None, speeds, angles
+    _outputs(constants(config), packed, spec.layers, *seen, outputs)
     return outputs
 
 
@@ -350,6 +358,6 @@ def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config
     closing = many[:, RAYS : 2 * RAYS] * fastest
     speeds = many[:, 2 * RAYS if spec.motion else RAYS] * fastest
     angles = many[:, -1] * F(math.radians(config.vehicle.steering_limit))
-    outputs = outputs_of(spec, genome, many[:, :RAYS] * F(config.sensors.range), closing, speeds, angles)
+    outputs = outputs_of(spec, genome, many[:, :RAYS] * F(config.sensors.range), closing, speeds, angles, config)
     actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
     return int(actions[0]) if np.ndim(observation) == 1 else actions

@@ -10,6 +10,7 @@ import math
 from gridsim.car import vehicle as kinematic
 from gridsim.car.single_track import SingleTrack, advance_single_track, single_track
 from gridsim.config import VehicleConfig
+from gridsim.errors import GridSimError
 from gridsim.jit import leaf
 from gridsim.state import SLIP, SPEED, STEERING, YAW_RATE
 
@@ -18,9 +19,9 @@ MODELS = {"kinematic": lambda vehicle: None, "single_track": single_track}
 
 
 def model_of(vehicle: VehicleConfig) -> Model:
-    """The parameters of a vehicle's model. Raises: ValueError for an unknown one."""
+    """The parameters of a vehicle's model. Raises: GridSimError for an unknown one."""
     if vehicle.model not in MODELS:
-        raise ValueError(f"vehicle model must be {' or '.join(MODELS)}, not {vehicle.model!r}")
+        raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {vehicle.model!r}")
     return MODELS[vehicle.model](vehicle)
 
 

@@ -38,10 +38,7 @@ class SingleTrack(NamedTuple):
 
 
 def single_track(vehicle: VehicleConfig) -> SingleTrack:
-    """The model of a vehicle. Raises: ValueError for a number that is not above 0."""
-    for name in ("mass", "yaw_inertia", "mass_height", "friction", "cornering_stiffness"):
-        if not 0.0 < getattr(vehicle, name) < math.inf:
-            raise ValueError(f"{name} must be above 0, not {getattr(vehicle, name)}")
+    """The model of a vehicle."""
     return SingleTrack(
         front=F(vehicle.wheelbase - vehicle.rear_axle),
         rear=F(vehicle.rear_axle),

@@ -10,7 +10,7 @@ Observation:
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (15 steps without progress)
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (1.5 s without progress)
 has no penalty: the last step is rewarded like any other.
 
 An episode depends only on its car's seed and its number: after `reset(seed=s)`, car i drives the episodes that a single
@@ -91,7 +91,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        config: SimConfig | None = None,
+        config: SimConfig | str | None = None,
     ):
         """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
@@ -105,6 +105,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 it only where there is a display.
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
+            config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
         """
         check_name(scenario)
         for name, value, known in (
@@ -120,14 +121,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"motion and steering are only for rays; leave them out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
-        self.num_envs, self.config = num_envs, config or SimConfig()
+        self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array", "human"] if render_mode == "human" or has_display() else ["rgb_array"],
             "render_fps": 1.0 / self.config.episode.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
-        traffic = default_traffic(scenario) if traffic is None else traffic
+        traffic = default_traffic(scenario, self.config) if traffic is None else traffic
         self.simulator = Simulator(num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
         self.render_mode = render_mode

@@ -19,7 +19,7 @@ class Atlas(NamedTuple):
     lanes: Network  # the arrays of all maps' networks
     bounds: np.ndarray  # int64 [maps + 1, 4], where each map's part of the field, points, lanes and crossings begin
     sides: np.ndarray  # uint32 [maps, 2], columns and rows
-    sizes: np.ndarray  # float32 [maps, 5], width and height (m), lower and upper speed (m/s), thinnest wall (m)
+    sizes: np.ndarray  # float32 [maps, 7], the other fields of `Road`
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
@@ -30,7 +30,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     lengths = [
         (len(r.field), len(n.points), len(n.steps), len(n.crossings)) for r, n in zip(roads, networks, strict=True)
     ]
-    sizes = [(r.width, r.height, r.speed_low, r.speed_high, r.thinnest) for r in roads]
+    sizes = [tuple(r)[3:] for r in roads]
     return Atlas(
         field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
         lanes=lanes,
@@ -44,7 +44,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
 def road_of(atlas: Atlas, m: int) -> Road:
     """Map m of an atlas."""
     field, sides, sizes = atlas.field[atlas.bounds[m, 0] : atlas.bounds[m + 1, 0]], atlas.sides[m], atlas.sizes[m]
-    return Road(field, sides[0], sides[1], sizes[0], sizes[1], sizes[2], sizes[3], sizes[4])
+    return Road(field, sides[0], sides[1], sizes[0], sizes[1], sizes[2], sizes[3], sizes[4], sizes[5], sizes[6])
 
 
 @njit

@@ -13,36 +13,34 @@ import hashlib
 import io
 import math
 import os
-import reprlib
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from PIL import Image
 
-from gridsim.config import FILE_SPEEDS, SimConfig, VehicleConfig
+from gridsim.config import FILE_SPEEDS, LIMITS, SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, without_lanes
 from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
-from gridsim.maps.roads import CELLS_PER_M
+from gridsim.maps.roads import CELLS_PER_UNIT
+from gridsim.reading import number, read_bytes, read_yaml, shown
 
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed"]
 
-MAX_BYTES = 1 << 27
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
 # Limits, from and to.
 RESOLUTION = (0.01, 1.0)  # m a pixel
 PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
-SHORTEST_SIDE = 16  # m
+SHORTEST_SIDE = 16  # units
 MOST_BORDER = 0.5  # share of road on a picture's border from which the picture is taken to be inverted
 
 
@@ -61,7 +59,7 @@ class MapFile:
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: Sequence[Sequence[float]] = ()
-    speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
+    speed: tuple[float, float] | None = None  # m/s, the speed interval; FILE_SPEEDS, for small cars less
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:
@@ -76,7 +74,7 @@ def map_digest(name: str) -> str:
     """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
     path = Path(os.path.abspath(name))
     files = dict.fromkeys((path, read_map_file(path).image))  # a picture alone is a map, too
-    return hashlib.sha256(b"".join(hashlib.sha256(_bytes(file)).digest() for file in files)).hexdigest()
+    return hashlib.sha256(b"".join(hashlib.sha256(read_bytes(file)).digest() for file in files)).hexdigest()
 
 
 def read_map_file(path: Path) -> MapFile:
@@ -86,112 +84,74 @@ def read_map_file(path: Path) -> MapFile:
         return MapFile(path)
     if suffix not in YAMLS:
         raise GridSimError(f"{path}: a map is a .yaml file of map_server's form or a picture ({', '.join(PICTURES)})")
-    text = _bytes(path)
-    try:
-        values = yaml.safe_load(text)
-    except Exception as error:  # PyYAML raises many types of error on invalid input
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or _shown(error)
-        raise GridSimError(f"{path}: not valid YAML{where}: {problem}") from None
+    values = read_yaml(path)
     try:
         return _checked(path, values)
     except ValueError as error:
         raise GridSimError(f"{path}: {error}") from None
 
 
-def _shown(value: object) -> str:
-    """A value's repr, shortened to one line of at most 80 characters."""
-    text = " ".join(reprlib.repr(value).split())
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _bytes(path: Path) -> bytes:
-    """A file's bytes; not those of a pipe or device, which may have no end, or of a file that is no map by its size."""
-    try:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise GridSimError(f"{path} is not a regular file")
-        if path.is_file() and path.stat().st_size > MAX_BYTES:
-            raise GridSimError(f"{path}: more than {MAX_BYTES >> 20} MiB; make it smaller")
-        return path.read_bytes()
-    except OSError as error:
-        raise GridSimError(f"{path}: {error.strerror or error}") from None
-    except ValueError:
-        raise GridSimError(f"{_shown(str(path))} is not a valid path") from None
-
-
-def _number(value: Any, what: str, low: float, high: float) -> float:
-    """A number within limits, also from text: YAML 1.1 reads 5e-2 as a string, ROS as a number."""
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
-    if not low <= number <= high:
-        raise ValueError(f"{what} must be a number from {low:g} to {high:g}, not {_shown(value)}")
-    return number
-
-
 def _numbers(value: Any, what: str, *limits: tuple[float, float]) -> list[float]:
     """A list of numbers, each within its limits."""
     if not isinstance(value, list) or len(value) != len(limits):
-        raise ValueError(f"{what} must be a list of {len(limits)} numbers, not {_shown(value)}")
-    return [_number(each, what, *limit) for each, limit in zip(value, limits, strict=True)]
+        raise ValueError(f"{what} must be a list of {len(limits)} numbers, not {shown(value)}")
+    return [number(each, what, *limit) for each, limit in zip(value, limits, strict=True)]
 
 
 def _checked(path: Path, values: Any) -> MapFile:
     """The MapFile of a YAML's values. Raises: ValueError without the file's name."""
     if not isinstance(values, dict):
-        raise ValueError(f"a map's YAML is a mapping with image and resolution, not {_shown(values)}")
+        raise ValueError(f"a map's YAML is a mapping with image and resolution, not {shown(values)}")
     unknown = [key for key in values if key not in KEYS]
     if unknown:
-        raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
+        raise ValueError(f"unknown key {shown(unknown[0])}; there are: {', '.join(KEYS)}")
     if "image" not in values or "resolution" not in values:
         raise ValueError("it needs an image, and its resolution (m a pixel)")
     mode, negate, starts = values.get("mode", "trinary"), values.get("negate", 0), values.get("starts", [])
     if mode not in ("trinary", "scale"):
-        raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
+        raise ValueError(f"mode must be trinary or scale (both have the same effect), not {shown(mode)}")
     if negate not in (0, 1):
-        raise ValueError(f"negate must be true or false, not {_shown(negate)}")
+        raise ValueError(f"negate must be true or false, not {shown(negate)}")
     if not isinstance(starts, list):
-        raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
+        raise ValueError(f"starts must be a list of [x, y, heading], not {shown(starts)}")
     x, y, yaw = _numbers(values.get("origin", [0, 0, 0]), "origin's x, y (m) and yaw (rad)", PLACE, PLACE, TURN)
     if abs(yaw) > 1e-6:
         raise ValueError(f"origin's yaw must be 0, not {yaw:g}; turn the picture instead")
-    free = _number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
-    occupied = _number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
+    free = number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
+    occupied = number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
     if not 0.0 < free <= occupied:
         raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
-    pace = 0.0, VehicleConfig().speed_limit
+    pace = 0.0, LIMITS["vehicle"]["speed_limit"][1]
     low, high = _numbers(values.get("speed", list(FILE_SPEEDS)), "speed (m/s)", pace, pace)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
     return MapFile(
         image=_image_path(path, values["image"]),
-        resolution=_number(values["resolution"], "resolution (m a pixel)", *RESOLUTION),
+        resolution=number(values["resolution"], "resolution (m a pixel)", *RESOLUTION),
         origin=(x, y),
         negate=bool(negate),
         free_thresh=free,
         starts=[_numbers(start, "a start's x, y (m) and heading (rad)", PLACE, PLACE, TURN) for start in starts],
-        speed=(low, high),
+        speed=(low, high) if "speed" in values else None,
     )
 
 
 def _image_path(path: Path, image: Any) -> Path:
     """The path of a YAML's picture, which must be in the YAML's folder or below."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
-        raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {_shown(image)}")
+        raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {shown(image)}")
     try:
         inside = (path.parent / image).resolve().is_relative_to(path.parent.resolve())
     except (OSError, ValueError, RuntimeError):  # a null character, a link to itself
-        raise ValueError(f"image: {_shown(image)} is not a valid path") from None
+        raise ValueError(f"image: {shown(image)} is not a valid path") from None
     if not inside:
-        raise ValueError(f"image: {_shown(image)} must lie in the YAML's own folder or below it")
+        raise ValueError(f"image: {shown(image)} must lie in the YAML's own folder or below it")
     return path.parent / image
 
 
 def read_free(file: MapFile) -> np.ndarray:
     """Which pixels are road: bool [rows, columns], the lowest row first."""
-    data = _bytes(file.image)
+    data = read_bytes(file.image)
     try:
         with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
             picture = Image.open(io.BytesIO(data), formats=tuple(dict.fromkeys(PICTURES.values())))
@@ -206,7 +166,7 @@ def read_free(file: MapFile) -> np.ndarray:
     try:
         free = _free(picture, file)
     except Exception as error:  # decoders raise many types of error
-        raise GridSimError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
+        raise GridSimError(f"{file.image}: truncated or damaged: {shown(str(error))}") from None
     if not free.any():
         raise GridSimError(f"{file.image}: all wall; road must be {'darker' if file.negate else 'brighter'}")
     if free.all():
@@ -231,27 +191,27 @@ def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
     return ((values if file.negate else 1.0 - values) < file.free_thresh)[light] & opaque
 
 
-def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
-    """Columns and rows of the field, in nodes: powers of two."""
+def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
+    """Columns and rows of the field, in nodes: powers of two; `pixel` in units."""
     sides = []
     for axis in (0, 1):
         used = np.flatnonzero(free.any(axis=axis))
-        first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
+        first, last = used[0] * pixel, (used[-1] + 1) * pixel
         side = max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE)
-        sides.append(1 << (math.ceil(side * CELLS_PER_M) - 1).bit_length())
+        sides.append(1 << (math.ceil(side * CELLS_PER_UNIT) - 1).bit_length())
     columns, rows = sides
-    width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
+    node = unit / CELLS_PER_UNIT
+    width, height = columns * node, rows * node
     if columns * rows > MAX_NODES:
         raise ValueError(
             f"a world of {width:,.0f} m x {height:,.0f} m (its sides are powers of two) is too large: "
-            f"at most {MAX_NODES / CELLS_PER_M**2:,.0f} square metres; check the resolution, or crop it"
+            f"at most {MAX_NODES * node**2:,.0f} square metres; check the resolution, or crop it"
         )
     return columns, rows
 
 
-def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit: float) -> None:
-    """Warn of a road so short that a second lap counts no distance, and of a picture that seems inverted."""
-    length = road_length(nodes)
+def _warn(stem: str, file: MapFile, free: np.ndarray, length: float, revisit: float) -> None:
+    """Warn of a road so short (m) that a second lap counts no distance, and of a picture that seems inverted."""
     if length <= 1.05 * revisit:  # 5 % for the error of the estimate
         text = (
             f"{stem} has about {length:.0f} m of road. Ground driven again within {revisit:g} m does not count: "
@@ -271,20 +231,22 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
 @lru_cache(maxsize=4)
 def _load(name: str, _digest: str, config: SimConfig) -> Map:
     """Build a map. The digest is part of the cache's key, so that a changed file is read again."""
-    path = Path(name)
+    path, unit, vehicle = Path(name), config.unit, config.vehicle
     file = read_map_file(path)
     free = read_free(file)
+    pixel = file.resolution / unit
+    vehicle = replace(vehicle, length=vehicle.length / unit, width=vehicle.width / unit)
     try:
-        columns, rows = _sides(free, file)
-        nodes = signed_clearance(free, file.resolution, columns, rows)
+        columns, rows = _sides(free, pixel, unit)
+        nodes = signed_clearance(free, pixel, columns, rows)
         if file.starts:
-            poses = np.array(file.starts) - [*file.origin, 0.0]
-            check_starts(nodes, poses, config.vehicle)
+            poses = (np.array(file.starts) - [*file.origin, 0.0]) / [unit, unit, 1.0]
+            check_starts(nodes, poses, vehicle, unit)
         else:
-            poses = find_starts(nodes, config.vehicle)
+            poses = find_starts(nodes, vehicle, unit)
     except ValueError as error:
         raise GridSimError(f"{path}: {error}") from None
-    _warn(path.stem, file, free, nodes, config.episode.revisit)
+    _warn(path.stem, file, free, road_length(nodes) * unit, config.episode.revisit)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
-    starts[:, :3] = poses
-    return without_lanes(name, nodes, file.speed, 2.0 * HALF_WALL, starts)
+    starts[:, :3] = poses * [unit, unit, 1.0]
+    return without_lanes(name, nodes, file.speed or config.file_speeds, 2.0 * HALF_WALL, starts, unit)

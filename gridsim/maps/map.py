@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from gridsim.jit import freeze, njit
+from gridsim.jit import F, freeze, njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, make_road
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, THICK_WALL, Road, Strips, make_road
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,15 @@ class Map:
         length[self.network.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
+    def magnified(self) -> Map:
+        """The map with a metre for each unit (`SimConfig.unit`), for pictures: they look alike for cars of any size."""
+        if self.road.unit == 1.0:
+            return self
+        road, per_m = self.road, float(self.road.per_m)
+        width, height = road.width * road.per_m, road.height * road.per_m
+        road = road._replace(width=width, height=height, unit=F(1.0), per_m=F(1.0))
+        return replace(self, road=road, strips=self.strips.scaled(per_m), network=self.network.scaled(per_m))
+
     @property
     def nbytes(self) -> int:
         """Bytes of its arrays."""
@@ -71,17 +80,22 @@ def _frozen(part: Any) -> Any:
 
 
 def without_lanes(
-    name: str, nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, starts: np.ndarray
+    name: str,
+    nodes: np.ndarray,
+    speed_interval: tuple[float, float],
+    thinnest: float,
+    starts: np.ndarray,
+    unit: float = 1.0,
 ) -> Map:
-    """A map that is all one clearance field (m) [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
-    height, width = (side / CELLS_PER_M for side in nodes.shape)
-    road, network = make_road(nodes, speed_interval, thinnest), lay_lanes([], width, height)
+    """A map that is all one clearance field [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
+    road = make_road(nodes, speed_interval, thinnest, unit)
+    network = lay_lanes([], float(road.width), float(road.height))
     return Map(name, 0, road, Strips.of(), network, torus=False, starts=freeze(starts))
 
 
 def blank() -> Map:
     """A map of 8 m x 8 m without any road, used to compile kernels before the first map is built."""
-    nodes = np.full((8 * CELLS_PER_M, 8 * CELLS_PER_M), FIELD_FLOOR, dtype=np.float32)
+    nodes = np.full((8 * CELLS_PER_UNIT, 8 * CELLS_PER_UNIT), FIELD_FLOOR, dtype=np.float32)
     return without_lanes("blank", nodes, (0.0, 1.0), THICK_WALL, np.zeros((0, 5), dtype=np.float32))
 
 

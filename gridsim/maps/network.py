@@ -38,6 +38,15 @@ class Network(NamedTuple):
     width: np.float32  # m, of the torus
     height: np.float32
 
+    def scaled(self, factor: float) -> Network:
+        """All lengths multiplied by a factor, a power of two; `speeds` are kept."""
+        if factor == 1.0:
+            return self
+        arrays = {
+            name: freeze(getattr(self, name) * F(factor)) for name in ("points", "steps", "clear", "room", "boxes")
+        }
+        return self._replace(**arrays, width=self.width * F(factor), height=self.height * F(factor))
+
 
 @njit
 def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, speeds):

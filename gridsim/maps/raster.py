@@ -1,4 +1,7 @@
-"""Maps from pictures: the signed clearance of the road, and poses where a car can start."""
+"""Maps from pictures: the signed clearance of the road, and poses where a car can start.
+
+All lengths are in units (`SimConfig.unit`), which are metres but for small cars: `files` converts them.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ import numpy as np
 from scipy import ndimage
 
 from gridsim.config import VehicleConfig
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
 _FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
 HALF_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
 _TIP = 0.25  # m that a corner may extend beyond a disc of radius HALF_WALL without being a thin wall
-_DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m, the largest clearance that the field holds
+_DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # m, the largest clearance that the field holds
 _HALO = _DEEPEST + 2.0  # m around a tile that can influence it
 _TILE = 128  # nodes
 
@@ -25,7 +28,7 @@ _EXTENT = 30.0  # m, least extent of a road with starts
 _SMOOTH = 3.0  # m, standard deviation of the window over which a road's direction is averaged
 _COHERENCE = 0.5  # least agreement of directions there, from 0 (an open place, a crossing) to 1 (a straight road)
 _STARTS = 512
-_NODE = 1.0 / CELLS_PER_M  # m
+_NODE = 1.0 / CELLS_PER_UNIT  # m
 _APART = 24  # nodes of wall around a window, so that averages on one side do not see the road on the other
 _BACK = np.array([0.0, 0.0, math.pi])
 
@@ -62,7 +65,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
     padded = np.pad(free, halo)
     # Road that begins at the picture's edge needs wall before it: nodes with negative indices wrap to the far end.
     used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
-    first = [min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
+    first = [min(math.floor((edge - OUTSIDE) * CELLS_PER_UNIT), 0) for edge in used]
     nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
     for j in range(0, rows, _TILE):
         for i in range(0, columns, _TILE):
@@ -90,7 +93,7 @@ def _clearance_around(nodes: np.ndarray, poses: np.ndarray, along: np.ndarray, l
     """Clearance (m) at points of a car's frame (m) at each of poses [n, 3]: [n, points], bilinear, as in kernels."""
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
     c, s = np.cos(heading), np.sin(heading)
-    at = [(y + along * s + left * c) * CELLS_PER_M, (x + along * c - left * s) * CELLS_PER_M]
+    at = [(y + along * s + left * c) * CELLS_PER_UNIT, (x + along * c - left * s) * CELLS_PER_UNIT]
     return ndimage.map_coordinates(nodes, at, order=1, mode="grid-wrap")
 
 
@@ -111,7 +114,7 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gy = np.roll(nodes, -1, axis=0) - np.roll(nodes, 1, axis=0)
 
     def smooth(values: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(values, _SMOOTH * CELLS_PER_M, mode="wrap", truncate=2.5)
+        return ndimage.gaussian_filter(values, _SMOOTH * CELLS_PER_UNIT, mode="wrap", truncate=2.5)
 
     xx, yy, xy = smooth(gx * gx), smooth(gy * gy), smooth(gx * gy)
     across = 0.5 * np.arctan2(2.0 * xy, xx - yy)
@@ -150,15 +153,19 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
     return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
 
 
-def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car."""
+def find_starts(nodes: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> np.ndarray:
+    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
+
+    Raises: ValueError, in m of `unit` m, if there are none.
+    """
     nodes, corner = _window(nodes)
     labels, _ = ndimage.label(nodes >= vehicle.width / 2 + _MARGIN)
     extent = [math.hypot(*(side.stop - side.start for side in box)) * _NODE for box in ndimage.find_objects(labels)]
     large = (np.array([0.0, *extent]) >= _EXTENT)[labels]  # label 0 is none
     if not large.any():
         raise ValueError(
-            f"no room for a car: the road is nowhere {vehicle.width + 2 * _MARGIN:g} m wide over {_EXTENT:g} m; "
+            f"no room for a car: the road is nowhere {unit * (vehicle.width + 2 * _MARGIN):.3g} m wide over "
+            f"{unit * _EXTENT:.3g} m; "
             f"check the resolution and which pixels are bright"
         )
     ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
@@ -172,17 +179,17 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & goes_on]
     if not len(poses):
         raise ValueError(
-            f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
-            f"check the resolution and which pixels are bright, or give starts in a YAML"
+            f"no room for a car of {unit * vehicle.length:g} m x {unit * vehicle.width:g} m with {unit * _AHEAD:g} m "
+            f"of road ahead; check the resolution and which pixels are bright, or give starts in a YAML"
         )
     poses[:, :2] += corner
     return _spread_sample(poses, _STARTS)
 
 
-def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> None:
+def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> None:
     """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
     inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * _NODE)).all(axis=1)
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):
-        x, y, _ = wrong[0]
+        x, y = wrong[0, :2] * unit
         raise ValueError(f"starts: at {x:g} m, {y:g} m from the lower left corner a car is not entirely on the road")

@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike
 
 from gridsim.jit import F, freeze, leaf, njit
 
-CELLS_PER_M = 2  # nodes of the clearance field per metre
-FIELD_FLOOR = -2.0  # m, clearance of byte 0, also of places deeper inside a wall
-FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
-VISIT_CELL = 4  # m, side of the cells in which new ground is counted
-THICK_WALL = 3.0  # m; among walls of this thickness or more, rays need no checks
+# In units (`SimConfig.unit`), which are metres but for small cars: their roads are the same fields, of smaller metres.
+CELLS_PER_UNIT = 2  # nodes of the clearance field per unit
+FIELD_FLOOR = -2.0  # clearance of byte 0, also of places deeper inside a wall
+FIELD_STEPS = 32.0  # steps of the byte per unit; byte 255 is 5.97
+VISIT_CELL = 4  # side of the cells in which new ground is counted
+THICK_WALL = 3.0  # among walls of this thickness or more, rays need no checks
 
 
 class Road(NamedTuple):
@@ -34,7 +35,9 @@ class Road(NamedTuple):
     height: np.float32  # m along y
     speed_low: np.float32  # m/s, the speed interval
     speed_high: np.float32  # m/s
-    thinnest: np.float32  # m; no ray passes a wall that is at least as thick as this
+    thinnest: np.float32  # units; no ray passes a wall that is at least as thick as this
+    unit: np.float32  # m, a power of two
+    per_m: np.float32  # units
 
 
 class Strips(NamedTuple):
@@ -50,12 +53,19 @@ class Strips(NamedTuple):
         rows = ((lines, 5), (arcs, 6), (blocks, 5))
         return cls(*(freeze(np.asarray(part, dtype=np.float64).reshape(-1, width)) for part, width in rows))
 
+    def scaled(self, factor: float) -> Strips:
+        """All lengths multiplied by a factor."""
+        if factor == 1.0:
+            return self
+        arcs, blocks = [factor, factor, factor, 1.0, 1.0, factor], [factor, factor, 1.0, factor, factor]
+        return Strips.of(self.lines * factor, self.arcs * arcs, self.blocks * blocks)
+
 
 @njit(nogil=True)
 def _cut_blocks(field, blocks, widest):
     """Lower the clearance at nodes around each block; `widest` is the largest half width of a road."""
     rows, columns = field.shape
-    node = 1.0 / CELLS_PER_M
+    node = 1.0 / CELLS_PER_UNIT
     for k in range(blocks.shape[0]):
         x, y, heading, half_length, half_width = blocks[k]
         c, s = math.cos(heading), math.sin(heading)
@@ -79,7 +89,7 @@ def _cut_blocks(field, blocks, widest):
 def _clearance_nodes(lines, arcs, columns, rows):
     """Maximum of (half width - distance) at each node, at least FIELD_FLOOR; visits only the nodes near each strip."""
     field = np.full((rows, columns), F(FIELD_FLOOR), dtype=np.float32)
-    node = 1.0 / CELLS_PER_M
+    node = 1.0 / CELLS_PER_UNIT
     for k in range(lines.shape[0] + arcs.shape[0]):
         is_line = k < lines.shape[0]
         if is_line:
@@ -121,23 +131,24 @@ def _clearance_nodes(lines, arcs, columns, rows):
 
 
 def pack_field(nodes: np.ndarray) -> np.ndarray:
-    """`Road.field` of the clearance (m) at the nodes [rows, columns]."""
-    units = (nodes - F(FIELD_FLOOR)) * F(FIELD_UNITS) + F(0.5)
-    here = np.clip(units, 0.0, 255.0).astype(np.uint8)
+    """`Road.field` of the clearance (units) at the nodes [rows, columns]."""
+    steps = (nodes - F(FIELD_FLOOR)) * F(FIELD_STEPS) + F(0.5)
+    here = np.clip(steps, 0.0, 255.0).astype(np.uint8)
     right, above = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
     return freeze(np.stack([here, right, above, np.roll(right, -1, axis=0)], axis=-1).view("<u4").ravel())
 
 
 def node_clearance(road: Road) -> np.ndarray:
-    """Clearance (m) at the nodes of a road's field: float32 [rows, columns]."""
-    units = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns))
-    return units.astype(np.float32) / F(FIELD_UNITS) + F(FIELD_FLOOR)
+    """Clearance (units) at the nodes of a road's field: float32 [rows, columns]."""
+    steps = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns))
+    return steps.astype(np.float32) / F(FIELD_STEPS) + F(FIELD_FLOOR)
 
 
 @leaf
 def clearance(road, x, y):
     """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also outside the torus."""
-    px, py = x * F(CELLS_PER_M), y * F(CELLS_PER_M)
+    nodes_per_m = F(CELLS_PER_UNIT) * road.per_m
+    px, py = x * nodes_per_m, y * nodes_per_m
     fx, fy = np.floor(px), np.floor(py)  # NumPy's floor returns float32 here, that of `math` int64
     ux, uy = px - fx, py - fy
     i = np.uint32(np.int32(fx)) & np.uint32(road.columns - np.uint32(1))
@@ -149,7 +160,7 @@ def clearance(road, x, y):
     q11 = F(np.int32(word >> np.uint32(24)))
     low = q00 + ux * (q10 - q00)
     high = q01 + ux * (q11 - q01)
-    return (low + uy * (high - low)) * F(1.0 / FIELD_UNITS) + F(FIELD_FLOOR)
+    return (low + uy * (high - low)) * (F(1.0 / FIELD_STEPS) * road.unit) + F(FIELD_FLOOR) * road.unit
 
 
 @njit
@@ -162,8 +173,8 @@ def clearances(road, points):
 
 
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
-    """Clearance float32 [rows, columns] at the nodes of the field, in m; the sides must be powers of two."""
-    columns, rows = round(width * CELLS_PER_M), round(height * CELLS_PER_M)
+    """Clearance float32 [rows, columns] at the nodes of the field, in units; the sides must be powers of two."""
+    columns, rows = round(width * CELLS_PER_UNIT), round(height * CELLS_PER_UNIT)
     if columns.bit_count() != 1 or rows.bit_count() != 1:
         raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")
     nodes = _clearance_nodes(strips.lines, strips.arcs, columns, rows)
@@ -172,16 +183,18 @@ def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
     return nodes
 
 
-def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float) -> Road:
-    """The Road of a clearance field (m) [rows, columns]; thinnest: of its walls, m."""
+def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, unit: float = 1.0) -> Road:
+    """The Road of a clearance field [rows, columns]; speeds m/s; thinnest, of its walls, in units as the field is."""
     rows, columns = nodes.shape
     return Road(
         field=pack_field(nodes),
         columns=np.uint32(columns),
         rows=np.uint32(rows),
-        width=F(columns / CELLS_PER_M),
-        height=F(rows / CELLS_PER_M),
+        width=F(columns * unit / CELLS_PER_UNIT),
+        height=F(rows * unit / CELLS_PER_UNIT),
         speed_low=F(speed_interval[0]),
         speed_high=F(speed_interval[1]),
         thinnest=F(thinnest),
+        unit=F(unit),
+        per_m=F(1.0 / unit),
     )

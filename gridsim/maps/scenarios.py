@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gridsim.config import FILE_SPEEDS, SimConfig
+from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
@@ -46,7 +45,7 @@ REGISTRY: dict[str, Scenario] = {
 
 def is_map_file(name: str) -> bool:
     """Whether a scenario's name is the path of a map file (`gridsim.maps.files`)."""
-    return "." in name or os.sep in name
+    return names_file(name)
 
 
 def check_name(name: str) -> None:
@@ -61,14 +60,19 @@ def label(name: str) -> str:
     return Path(name).stem if is_map_file(name) else name
 
 
-def default_traffic(name: str) -> int:
-    """A scenario's default number of other cars; 0 on a map from a file, which has no lanes."""
-    return REGISTRY[name].traffic if name in REGISTRY else 0
+def default_traffic(name: str, config: SimConfig | None = None) -> int:
+    """A scenario's default number of other cars; 0 on a map from a file, which has no lanes, and for small cars."""
+    small = config is not None and config.unit < 1.0
+    return REGISTRY[name].traffic if name in REGISTRY and not small else 0
 
 
-def speed_interval(name: str) -> tuple[float, float]:
-    """A scenario's speed interval, m/s; for a map file, the default of files."""
-    return REGISTRY[name].speed_interval if name in REGISTRY else FILE_SPEEDS
+def speed_interval(name: str, config: SimConfig) -> tuple[float, float]:
+    """A scenario's speed interval, m/s."""
+    if name in REGISTRY:
+        low, high = REGISTRY[name].speed_interval
+        return low * config.pace, high * config.pace
+    road = build(name, 0, config).road
+    return float(road.speed_low), float(road.speed_high)
 
 
 def seed_of_map(name: str, seed: int) -> int:
@@ -77,7 +81,11 @@ def seed_of_map(name: str, seed: int) -> int:
 
 
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
-    """Build a scenario's map from a seed; the same seed gives the same map."""
+    """Build a scenario's map from a seed; the same seed gives the same map.
+
+    For a small car, a generated road is as much smaller as the car's unit (`SimConfig.unit`).
+    """
+    config = config or SimConfig()
     check_name(name)
     if seed < 0:
         raise GridSimError(f"a seed must be 0 or more, not {seed}")
@@ -89,5 +97,6 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes = spec.layout(rng)
     nodes = clearance_nodes(strips, float(lanes.width), float(lanes.height))
-    road = make_road(nodes, spec.speed_interval, spec.thinnest)
-    return Map(name, seed, road, strips, make_network(lanes, road, config or SimConfig()))
+    road = make_road(nodes, speed_interval(name, config), spec.thinnest, config.unit)
+    strips, lanes = strips.scaled(config.unit), lanes.scaled(config.unit)
+    return Map(name, seed, road, strips, make_network(lanes, road, config))

@@ -1,6 +1,7 @@
 """The occupancy grid: the ground ahead, cell by cell, computed from the range sensor's rays.
 
-80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side. Row 0 is the farthest ahead and
+80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side; for small cars of half a unit
+(`SimConfig.unit`). Row 0 is the farthest ahead and
 column 0 the leftmost, as in a picture that looks ahead. Each cell within the field of view belongs to the ray whose
 direction is nearest to its centre's. With r the centre's distance from the front axle, R the ray's range and h half the
 diagonal of a cell, the cell is
@@ -24,11 +25,11 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import F, U, freeze, leaf, njit
 
 CELLS = 80  # along each side
-CELL = 0.5  # m
+CELL = 0.5  # units
 MAX_FRAMES = 8  # in an observation
 #: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
-HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # m
+HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # units
 
 
 class GridTable(NamedTuple):
@@ -38,15 +39,17 @@ class GridTable(NamedTuple):
     cells: np.ndarray  # uint16 [cells in view]: index into a grid, row by row
     radii: np.ndarray  # float32 [cells in view + 1]: m, of the centres from the front axle; the last is infinite
     reach: np.float32  # m, the rays' full range
+    half: np.float32  # m, half the diagonal of a cell
 
 
 @cache
 def grid_table(config: SimConfig) -> GridTable:
     """The table for a configuration's rays. Raises: ValueError as `config.constants`."""
     k, sensors = constants(config), config.sensors
-    at = (np.arange(CELLS) + 0.5) * CELL
+    cell = CELL * config.unit
+    at = (np.arange(CELLS) + 0.5) * cell
     # Centres of the cells, float64 [80, 80]: m ahead of the front axle, and m to the left.
-    ahead, left = np.meshgrid(CELLS * CELL - at, CELLS * CELL / 2 - at, indexing="ij")
+    ahead, left = np.meshgrid(CELLS * cell - at, CELLS * cell / 2 - at, indexing="ij")
     angle, radius = np.arctan2(left, ahead), np.hypot(left, ahead)
     view = math.radians(sensors.field_of_view)
     ray = np.rint((angle + view / 2) / (view / (sensors.rays - 1))).astype(np.int64)
@@ -58,6 +61,7 @@ def grid_table(config: SimConfig) -> GridTable:
         freeze(order.astype(np.uint16)),
         freeze(np.append(radius.ravel()[order], np.inf).astype(np.float32)),
         k.ray_range,
+        HALF_DIAGONAL * k.unit,
     )
 
 
@@ -69,7 +73,7 @@ def fill_grid(table, ranges, grid):
     # Unsigned indices, because Numba checks whether signed ones are negative.
     for ray in range(ranges.shape[0]):
         hit = ranges[ray]
-        near, far = hit - HALF_DIAGONAL, hit + HALF_DIAGONAL
+        near, far = hit - table.half, hit + table.half
         if hit >= table.reach:
             near = far = table.reach
         k, last = U(table.first[ray]), U(table.first[ray + 1])

@@ -16,11 +16,11 @@ import numpy as np
 
 from gridsim.jit import ONE, ZERO, F, I, freeze, leaf
 from gridsim.maps.network import wrapped
-from gridsim.maps.roads import CELLS_PER_M, THICK_WALL
+from gridsim.maps.roads import CELLS_PER_UNIT, THICK_WALL
 from gridsim.sensing.simd import LEAP, MARGIN, SIMD_RAYS, vector_march
 from gridsim.state import COS, LANE, SIN, SPEED, X, Y
 
-_SCALE = np.float32(CELLS_PER_M)
+_SCALE = np.float32(CELLS_PER_UNIT)
 _march, _march_among_thin_walls = vector_march(16, False), vector_march(24, True)
 
 
@@ -41,16 +41,20 @@ def sense(road, fan, reach, x, y, cosine, sine, ranges):
     Args: fan of `fan()`, reach m, position m, heading as cosine and sine.
     Writes: ranges float32 [rays], in [0, reach].
     """
-    px0, py0 = x * _SCALE, y * _SCALE
+    scale = _SCALE * road.per_m
+    px0, py0, far = x * scale, y * scale, reach * road.per_m
     for block in range(0, fan.shape[1], SIMD_RAYS):
         # fmt: off
         if road.thinnest < THICK_WALL:  # two calls, because a variable that holds either function would not be inlined
-            _march_among_thin_walls(road.field, road.columns, road.rows, px0, py0, reach, cosine, sine,
+            _march_among_thin_walls(road.field, road.columns, road.rows, px0, py0, far, cosine, sine,
                                     fan, block, road.thinnest - MARGIN, ranges)
         else:
-            _march(road.field, road.columns, road.rows, px0, py0, reach, cosine, sine,
+            _march(road.field, road.columns, road.rows, px0, py0, far, cosine, sine,
                    fan, block, LEAP, ranges)
         # fmt: on
+    if road.unit != ONE:
+        for ray in range(ranges.shape[0]):
+            ranges[ray] *= road.unit
 
 
 @leaf

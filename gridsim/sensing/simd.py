@@ -15,25 +15,27 @@ from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
 from gridsim.jit import F
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 SIMD_RAYS = 32
-# Chosen for a small error with few steps of the slowest ray, over 4,000 poses: 99th percentile 0.06 m.
-_NEAR = F(2.0)  # m of clearance below which Newton steps are taken
+# In the field's units. Chosen for a small error with few steps of the slowest ray, over 4,000 poses: 99th percentile
+# 0.06.
+_NEAR = F(2.0)  # clearance below which Newton steps are taken
 _STRETCH = F(1.5)  # length of a step above it, in clearances
-_CLOSE = F(0.04)  # m of clearance at which a ray has arrived
+_CLOSE = F(0.04)  # clearance at which a ray has arrived
 _SLOPE_MIN = F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
-LEAP = F(2.0)  # m added to a stretched step; still shorter than any wall of 3 m or more
-MARGIN = F(0.1)  # m of safety: among thin walls, unseen gaps are at most the walls' thickness less this
+LEAP = F(2.0)  # added to a stretched step; still shorter than any wall of 3 or more
+MARGIN = F(0.1)  # of safety: among thin walls, unseen gaps are at most the walls' thickness less this
 
 
 def vector_march(steps: int, look_back: bool) -> Any:
     """Build the intrinsic that moves each of SIMD_RAYS rays to the edge of the road, in at most `steps` steps.
 
-    Its arguments: packed field with its sides; origin in cells; reach m; the heading as cosine and sine; fan of
-    `rays.fan` and the index of the first ray to march; the leap m; ranges float32 [rays], written from that ray on, in
-    [0, reach]. It runs until the last ray has arrived. With `look_back`, a ray goes back to see the blind part of a
-    step that is longer than the leap; without, no code for that is emitted, and walls thinner than 3 m may be passed.
+    Its arguments: packed field with its sides; origin in cells; reach; the heading as cosine and sine; fan of
+    `rays.fan` and the index of the first ray to march; the leap; ranges float32 [rays], written from that ray on, in
+    [0, reach]; lengths in units. It runs until the last ray has arrived. With `look_back`, a ray goes back to see the
+    blind part of a step that is longer than the leap; without, no code for that is emitted, and walls thinner than 3
+    may be passed.
     """
 
     @intrinsic
@@ -92,7 +94,7 @@ def vector_march(steps: int, look_back: bool) -> Any:
             cosine, sine = splat(args[6], vf), splat(args[7], vf)
             dx = sub(mul(cosine, of_fan(0)), mul(sine, of_fan(1)))
             dy = add(mul(sine, of_fan(0)), mul(cosine, of_fan(1)))
-            sx, sy = mul(dx, const(CELLS_PER_M)), mul(dy, const(CELLS_PER_M))
+            sx, sy = mul(dx, const(CELLS_PER_UNIT)), mul(dy, const(CELLS_PER_UNIT))
 
             def look(t: ir.Value | None) -> tuple[ir.Value, ir.Value]:
                 """Clearances and next steps (m) at ranges `t`, or at the origin, where all rays read the same word."""
@@ -116,9 +118,9 @@ def vector_march(steps: int, look_back: bool) -> Any:
                 rise_low, rise_high = sub(q10, q00), sub(q11, q01)
                 low, high = add(q00, mul(ux, rise_low)), add(q01, mul(ux, rise_high))
                 across = sub(high, low)
-                clear = add(mul(add(low, mul(uy, across)), const(1.0 / FIELD_UNITS)), const(FIELD_FLOOR))
+                clear = add(mul(add(low, mul(uy, across)), const(1.0 / FIELD_STEPS)), const(FIELD_FLOOR))
                 along = add(mul(dx, add(rise_low, mul(uy, sub(rise_high, rise_low)))), mul(dy, across))
-                slope = mul(along, const(-CELLS_PER_M / FIELD_UNITS))
+                slope = mul(along, const(-CELLS_PER_UNIT / FIELD_STEPS))
                 slope = least(most(slope, const(_SLOPE_MIN)), const(1.0))
                 wide = builder.fcmp_ordered(">", clear, const(_NEAR))
                 stretched = mul(clear, const(_STRETCH))

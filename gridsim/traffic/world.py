@@ -14,6 +14,7 @@ import numpy as np
 from gridsim import state as s
 from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, STOP_LINE_GAP, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform, uniform64
+from gridsim.errors import GridSimError
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import Network, wrapped
 
@@ -115,11 +116,18 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
             car[s.LANE] = -ONE
 
 
+def check_traffic(cars: int, config: SimConfig) -> None:
+    """Raises: GridSimError if so many other cars cannot drive, because they are too small for what traffic assumes."""
+    if cars and config.unit < 1.0:
+        raise GridSimError(f"traffic is for cars of 2.9 m or more, not of {config.vehicle.length:g} m: use traffic 0")
+
+
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
     """Worlds float32 [n, cars, TRAFFIC_FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
+    check_traffic(cars, config)
     worlds, traffic = np.zeros((len(starts), cars, s.TRAFFIC_FIELDS), dtype=np.float32), config.traffic
     worlds[:, :, s.LANE] = -1.0
     if cars and len(network.offsets) > 1:

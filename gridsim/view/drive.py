@@ -9,13 +9,13 @@ from __future__ import annotations
 import csv
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from gridsim.car.vehicle import Action
-from gridsim.config import EpisodeConfig, SimConfig
+from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
@@ -26,13 +26,13 @@ from gridsim.view.render import Renderer, Window, interpolate
 
 # The columns of a recorded drive: the time is since the episode's start, and a restart begins the next episode.
 _POSE = ("x_m", "y_m", "heading_rad", "speed_mps", "steering_rad")
-COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed")
+COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed", "sim")
 MAX_TRAFFIC = 1000  # of a drive that is read
 LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
-PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
 _ENDLESS = 10_000_000  # control steps
+_PATIENCE = 1e6  # s
 
 HELP = "arrows drive   space brakes   R restarts   Esc ends"
 
@@ -47,14 +47,15 @@ class Drive:
     episodes: np.ndarray  # int64 [n], counted from 0; each begins at the pose of its first row
     poses: np.ndarray  # float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step
     actions: np.ndarray  # int64 [n]
+    sim: str  # what `SimConfig.load` takes
 
     def __len__(self) -> int:
         return len(self.actions)
 
 
-def manual(traffic: int = 0) -> Simulator:
+def manual(config: SimConfig, traffic: int = 0) -> Simulator:
     """A simulator of one car in traffic, whose episode ends only with a collision."""
-    config = SimConfig(episode=EpisodeConfig(patience=_ENDLESS))
+    config = replace(config, episode=replace(config.episode, patience=_PATIENCE))
     return Simulator(1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
@@ -83,9 +84,10 @@ def action_for(keys: set[str], speed: float) -> Action:
 class Recorder:
     """Writes a drive to a new file row by row, so that an interrupted drive is kept, too."""
 
-    def __init__(self, path: str | os.PathLike[str], road_map: Map, traffic: int = 0):
-        """Create the file. Raises: GridSimError if it exists or cannot be created."""
-        self._map = (traffic, road_map.name, road_map.seed)
+    def __init__(self, path: str | os.PathLike[str], road_map: Map, traffic: int = 0, sim: str = "default"):
+        """Create the file; `sim` as in Drive. Raises: GridSimError if it exists or cannot be created."""
+        self._map = (traffic, road_map.name, road_map.seed, sim)
+        self._period = SimConfig.load(sim).episode.control_period
         self.path, self.rows = Path(path), 0
         try:
             self._file = open(path, "x", newline="", encoding="utf-8", buffering=1)  # noqa: SIM115, closed by close()
@@ -99,7 +101,7 @@ class Recorder:
     def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
         """Write one row: control steps since the episode's start; pose float32 [5]. Raises GridSimError."""
         # Nine digits represent a float32 exactly.
-        numbers = [f"{value:.9g}" for value in (round(step * PERIOD, 6), *pose.tolist())]
+        numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
         try:
             self._writer.writerow([*numbers, int(action), episode, *self._map])
         except OSError as error:
@@ -126,29 +128,32 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
 
 def _drive_of(reader: csv.DictReader[str]) -> Drive:
     """The drive of a file's rows. Raises: ValueError or csv.Error at the first one that does not fit."""
-    if reader.fieldnames != [*COLUMNS]:
+    if reader.fieldnames not in ([*COLUMNS], [*COLUMNS[:-1]]):  # the latter is an earlier one's, of the default car
         raise ValueError(f"the first line must be {','.join(COLUMNS)}")
     poses: list[list[float]] = []
     actions: list[int] = []
     episodes = [-1]
-    roads: set[tuple[str, int, int]] = set()
+    roads: set[tuple[str, int, int, str]] = set()
+    period = 0.0
     steps = 0  # since the episode's start
     for row in reader:
         time, *pose = (float(row[name]) for name in COLUMNS[:6])
         poses.append(pose)
         action, episode, traffic, seed = (int(row[name]) for name in ("action", "episode", "traffic", "map_seed"))
-        roads.add((row["scenario"], seed, traffic))
-        check_name(row["scenario"])
+        roads.add((row["scenario"], seed, traffic, row.get("sim", "default")))
+        if not period:
+            check_name(row["scenario"])
+            period = SimConfig.load(row.get("sim", "default")).episode.control_period
         steps = steps + 1 if episode == episodes[-1] else 0
         for fits, text in (
             (None not in row, f"it has more than {len(COLUMNS)} columns"),
             (all(abs(value) <= limit for value, limit in zip(pose, LIMITS, strict=True)), "its pose is out of range"),
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
-            (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; rows missing or doubled?"),
+            (abs(time - steps * period) < period / 2, f"time_s must be {steps * period:g}; rows missing or doubled?"),
             (0 <= traffic <= MAX_TRAFFIC, f"traffic must be 0 to {MAX_TRAFFIC} cars"),
             (0 <= seed < 1 << 63, "map_seed must be 0 or more, and fit 63 bits"),
-            (len(roads) == 1, "traffic, scenario and map_seed must be the same in all rows"),
+            (len(roads) == 1, "traffic, scenario, map_seed and sim must be the same in all rows"),
         ):
             if not fits:
                 raise ValueError(text)
@@ -156,8 +161,9 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
         episodes.append(episode)
     if not poses:
         raise ValueError("it has no rows; nothing was driven")
-    ((scenario, seed, traffic),) = roads
-    return Drive(scenario, seed, traffic, np.array(episodes[1:]), np.array(poses, np.float32), np.array(actions))
+    ((scenario, seed, traffic, sim),) = roads
+    poses_, actions_ = np.array(poses, np.float32), np.array(actions)
+    return Drive(scenario, seed, traffic, np.array(episodes[1:]), poses_, actions_, sim)
 
 
 def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
@@ -167,7 +173,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     the traffic float32 [n, others, TRAFFIC_FIELDS]).
     Raises: GridSimError if an episode ends too early, which means that the map is another one.
     """
-    simulator, n, rows = manual(drive.traffic), len(drive), []
+    simulator, n, rows = manual(SimConfig.load(drive.sim), drive.traffic), len(drive), []
     begins = np.diff(drive.episodes, prepend=-1) != 0
     for k in range(n):
         if begins[k]:
@@ -199,16 +205,17 @@ def drive(
     Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them. Raises: GridSimError.
     """
-    simulator = manual(traffic)
-    pictures = round(PERIOD * FPS)  # a control step
+    simulator = manual(renderer.config, traffic)
+    period = renderer.config.episode.control_period
+    pictures = max(round(period * FPS), 1)  # a control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
     _begin(simulator, road_map, start, 0)
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
-        if window.closed or pressed & {"escape", "q"} or steps * PERIOD >= seconds:
-            return {"seconds": steps * PERIOD, "episodes": episode + 1, "distance_m": best}
+        if window.closed or pressed & {"escape", "q"} or steps * period >= seconds:
+            return {"seconds": steps * period, "episodes": episode + 1, "distance_m": best}
         if "r" in pressed:
             if simulator.cars[0, STEPS] > 0:
                 episode += 1
@@ -228,7 +235,7 @@ def drive(
         for k in range(1, pictures + 1):
             part = k / pictures
             car = interpolate(before, after, part, road_map)
-            text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * PERIOD:.1f} s"
+            text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * period:.1f} s"
             if ended:
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
@@ -236,5 +243,5 @@ def drive(
                 car, boxes=interpolate(there, then, part, road_map),
                 ranges=view + np.float32(part) * (simulator.ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
-            window.show(image, FPS)
+            window.show(image, pictures / period)
         path.append(after[[X, Y]].copy())

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from gridsim.jit import F, njit
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, Road, clearance, node_clearance, pack_field
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, Road, clearance, node_clearance, pack_field
 
 GROUND = (226, 231, 218)
 GROUND_OTHER = (220, 226, 211)  # of every other square, so that motion is visible
@@ -77,7 +77,7 @@ def smoothed(road: Road) -> Road:
     The clearance dips where strips meet, in the middle of a junction even to 0, which would be drawn as an edge.
     """
     nodes = node_clearance(road)
-    least = minimum_filter(nodes, 2 * round(DIP * CELLS_PER_M) + 1, mode="wrap")
+    least = minimum_filter(nodes, 2 * round(DIP * CELLS_PER_UNIT) + 1, mode="wrap")
     return road._replace(field=pack_field(np.where(least > -0.09, np.maximum(nodes, DIP), nodes)))
 
 

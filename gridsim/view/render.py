@@ -26,7 +26,7 @@ from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
-METRES = 52.0  # m, height of a picture
+METRES = 52.0  # height of a picture, like all lengths here in units (`SimConfig.unit`), which are m but for small cars
 CAR_AT = 0.74  # height of the car in a picture, as a share from the top
 
 
@@ -40,21 +40,24 @@ class Renderer:
     def __init__(self, road_map: Map, size: tuple[int, int] = (640, 480), config: SimConfig | None = None):
         """Prepare pictures of `size` (width, height in pixels)."""
         width, height = size
-        self.road_map, self.size = road_map, size
+        self.road_map, self.size = road_map.magnified(), size
         self.config = config or SimConfig()
         self._constants = constants(self.config)
-        self._road = paint.smoothed(road_map.road)
+        self._per_m = float(road_map.road.per_m)
+        self._road = paint.smoothed(self.road_map.road)
         self.pixels_per_m = height / METRES
         self._anchor = np.array([width / 2, height * CAR_AT])
-        self._centre, self._up = road_map.size / 2, np.array([0.0, 1.0])
-        self._marks = lane_marks(road_map)
-        self._parked = road_map.strips.blocks
+        self._centre, self._up = self.road_map.size / 2, np.array([0.0, 1.0])
+        self._marks = lane_marks(self.road_map)
+        self._parked = self.road_map.strips.blocks
         vehicle, k = self.config.vehicle, self._constants
-        self._outline = (vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle))
+        lengths = vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle)
+        a, b, front, rear = (length * self._per_m for length in lengths)
+        self._outline = a, b, front, rear
         self._other = paint.car_parts(*self._outline, 0.0, paint.OTHER)
 
     def pixel(self, points: np.ndarray) -> np.ndarray:
-        """Pixels float64 [n, 2] (x right, y down) of points [n, 2] (m) in the last picture drawn.
+        """Pixels float64 [n, 2] (x right, y down) of points [n, 2] (units) in the last picture drawn.
 
         On a torus, the copy of a point that is nearest to the view's centre.
         """
@@ -88,7 +91,7 @@ class Renderer:
             text: a line for the lower left, and one for the upper left.
         """
         width, height = self.size
-        position, heading = np.asarray(car[[X, Y]], np.float64), np.asarray(car[[COS, SIN]], np.float64)
+        position, heading = np.asarray(car[[X, Y]], np.float64) * self._per_m, np.asarray(car[[COS, SIN]], np.float64)
         self._centre, self._up = position, heading / max(math.hypot(*heading), 1e-9)
         image = np.empty((height, width, 3), dtype=np.uint8)
         right = np.array([self._up[1], -self._up[0]])
@@ -98,11 +101,11 @@ class Renderer:
         paint.draw_ground(self._road, self.road_map.torus, origin, *steps, self.pixels_per_m, image)
         shapes = [self._mark_shapes(), self._block_shapes()]
         if path is not None:
-            shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64)))
+            shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64) * self._per_m))
         if ranges is not None:
-            shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64)))
+            shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64) * self._per_m))
         if boxes is not None:
-            shapes.append(self._placed(self._other, boxes[:, :2], boxes[:, 2:4]))
+            shapes.append(self._placed(self._other, boxes[:, :2] * self._per_m, boxes[:, 2:4]))
         own = paint.car_parts(*self._outline, float(car[STEERING]), paint.EGO)
         shapes.append(self._placed(own, position[None], heading[None]))
         paint.draw_shapes(freeze(np.concatenate(shapes)), image)
@@ -182,11 +185,12 @@ class Renderer:
         angle = k.ray_first + k.ray_step * np.arange(len(ranges))
         c, s = np.cos(angle), np.sin(angle)
         direction = np.stack([heading[0] * c - heading[1] * s, heading[1] * c + heading[0] * s], axis=1)
-        origin, along = self.pixel(position + k.front_axle * heading), self._turn(direction)
+        front = float(k.front_axle) * self._per_m
+        origin, along = self.pixel(position + front * heading), self._turn(direction)
         reach = along * ranges[:, None] * self.pixels_per_m
         rays = self._shapes(origin + reach / 2, along, ranges / 2, 0.04, 0.0, paint.RAY, 0.5)
         rays[:, 10] = np.maximum(rays[:, 10], 0.3)
-        hit = ranges < float(k.ray_range) - 1e-3
+        hit = ranges < float(k.ray_range) * self._per_m - 1e-3
         dots = self._shapes((origin + reach)[hit], along[hit], 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
         return np.concatenate([rays, dots])
 

@@ -11,9 +11,11 @@ from cluster import api, evaluator
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.store.champion import held_out
 from cluster.store.checkpoint import CheckpointError, save
+from cluster.store.folder import RunError, RunFolder, read_config
 from evolution.episodes.rollout import trajectory
 from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec
+from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs import sb3
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
@@ -169,3 +171,59 @@ def test_gridsim_itself_has_the_python_api_and_its_examples_run():
     for module, least in ((api, 5), (evaluator, 2), (sb3, 4)):
         done = doctest.testmod(module)
         assert (done.attempted >= least, done.failed) == (True, 0)
+
+
+# --- A car of one's own ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_sim(tmp_path):
+    """A file of a longer car that is done after 30 m."""
+    path = tmp_path / "car.yaml"
+    path.write_text("vehicle: {length: 4.5}\nepisode: {target: 30, time_limit: 20}\n")
+    return path
+
+
+def test_a_champion_learns_validates_and_is_measured_with_its_own_car(own_sim, tmp_path):
+    seen = []
+
+    def fitness(results, targets):
+        seen.append(targets)
+        return results["distance"].sum(axis=1)
+
+    champion, _ = evolve(scenario="curved", sim=str(own_sim), population=16, generations=2, fitness=fitness)
+    assert champion.sim == SimConfig.load(own_sim) != SimConfig()
+    assert np.max(seen[0]) == 30.0
+    champion.save(tmp_path / "champion.npz")
+    own_sim.unlink()
+    again = load_champion(tmp_path / "champion.npz")
+    assert again.sim == champion.sim
+    chosen, _ = held_out(again, None, 8, 2_000_000, None)
+    assert set(chosen.rows["target"]) == {30.0}
+    assert again.make_env().unwrapped.cars.config == champion.sim
+    assert evaluate(again, episodes=8, sim="default") != evaluate(again, episodes=8)
+    with pytest.raises(GridSimError, match="sees 31 rays, the sensor has 40"):
+        evaluate(again, episodes=8, sim=SimConfig(sensors=SensorConfig(rays=40)))
+
+
+def test_a_run_keeps_its_car_and_refuses_another(own_sim, tmp_path):
+    run = RunFolder(tmp_path / "run", EvolveSettings(sim=str(own_sim)))
+    run.path.mkdir()
+    run.write_config()
+    assert run.config()["simulator"]["vehicle"]["length"] == 4.5
+    settings, _ = read_config(run.path / "config.json")
+    assert settings == run.settings
+    digest = run.digest()
+    own_sim.write_text("vehicle: {length: 4.6}\n")
+    assert run.digest() != digest
+    with pytest.raises(RunError, match=r"--sim .*car.yaml is not what it was for"):
+        read_config(run.path / "config.json")
+
+
+def test_champions_of_former_versions_count_patience_in_seconds(champion, tmp_path):
+    sim = dataclasses.asdict(champion.sim)
+    sim["episode"] |= {"patience": 15, "progress": 0.05, "control_period": 0.1}
+    sim["traffic"] |= {"kerb": 0.3}
+    meta = {"policy": champion.policy, "scenario": champion.scenario, "traffic": 0, "sim": sim}
+    save(tmp_path / "c.npz", {"genome": champion.genome}, meta)
+    assert load_champion(tmp_path / "c.npz").sim == SimConfig()

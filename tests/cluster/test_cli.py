@@ -167,6 +167,9 @@ def test_init_begins_with_a_champion(reference, tmp_path):
 
 WRONG = [
     ("--scenario moon", "unknown scenario"),
+    ("--sim f1tent", "unknown simulator 'f1tent'; did you mean f1tenth?"),
+    ("--sim none.yaml", "none.yaml: No such file"),
+    ("--sim f1tenth --scenario city --traffic 3", "traffic is for cars of 2.9 m or more"),
     ("--workers -1", "--workers"),
     ("--patience -1", "--patience must be 0 or more"),
     ("--output /proc/nowhere", "--output"),

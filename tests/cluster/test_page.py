@@ -36,7 +36,7 @@ def channels(drive):
 def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
     champion, drive, *shown = shown_drives()
     title = "</script><script>alert(1)</script>"  # a name of the user's own
-    write_page(tmp_path / "drive.html", title, shown, champion.sim)
+    write_page(tmp_path / "drive.html", title, shown)
     page = (tmp_path / "drive.html").read_text()
     assert len(page.encode()) < 1_500_000
     assert "http://" not in page
@@ -84,19 +84,19 @@ def test_a_map_file_is_shown_from_side_to_side_of_its_road():
 @pytest.mark.e2e
 @needs_chromium
 def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
-    champion, drive, *shown = shown_drives()
+    _, drive, *shown = shown_drives()
     path = tmp_path / "drive.html"
-    write_page(path, "one drive", shown[1:], champion.sim)
+    write_page(path, "one drive", shown[1:])
     with Browser(path.as_uri(), tmp_path / "profile") as browser:
         browser.wait_for("at > 1")
         assert browser.faults == []
-    write_page(path, "two drives", shown, champion.sim, together=True)
+    write_page(path, "two drives", shown, together=True)
     with Browser(path.as_uri(), tmp_path / "profile") as browser:
         browser.wait_for("$('time').max > 0")
         assert browser.run("$('label').textContent") == "elite"
         assert browser.run("$('all').checked")
         assert float(browser.run("$('time').max")) == pytest.approx(drive.seconds, abs=0.2)
-    write_page(path, "two drives", shown, champion.sim)
+    write_page(path, "two drives", shown)
     with Browser(f"{path.as_uri()}#t=3.2&paused", tmp_path / "profile") as browser:
         browser.wait_for("$('clock').textContent === '0:03.2'")
         assert browser.run("$('label').textContent") == "champion"

@@ -19,7 +19,7 @@ from evolution.episodes.rollout import RESULT, collect, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode, outputs_of
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
 from gridsim.simulator import Simulator
@@ -34,7 +34,7 @@ TARGET, STEPS = 1000.0, 1700
 def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
     ranges, speeds = simulator.ranges, simulator.cars[:, SPEED].copy()
-    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
+    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds), CONFIG).argmax(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
         car, ranges, ends = simulator.cars[0], simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
-            encode(ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
+            encode(constants(CONFIG), ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
             assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
             row += 1
@@ -261,7 +261,7 @@ TASK = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2
 
 @pytest.fixture
 def curriculum():
-    return Curriculum(TASK, 7, lambda seed: build("seamless", seed), traffic=2)
+    return Curriculum(TASK, 7, lambda seed: build("seamless", seed), CONFIG, traffic=2)
 
 
 def led(curriculum, generation, ends, distance=0.0, steps=50):

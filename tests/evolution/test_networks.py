@@ -23,7 +23,7 @@ from evolution.networks.export import to_onnx
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on, gene_scales, outputs_of
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.car.vehicle import Action
-from gridsim.config import SensorConfig, SimConfig, VehicleConfig
+from gridsim.config import SensorConfig, SimConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.sensing.grid import CELLS, grid_table, grids
 
@@ -89,7 +89,7 @@ def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
 
 def test_what_the_network_sees():
     inputs, ranges = np.zeros(33, dtype=F), np.linspace(0, 50, 31)
-    policy.encode(ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    policy.encode(constants(SimConfig()), ranges.astype(F), None, F(12.5), F(-0.1), inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
     assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
@@ -204,7 +204,7 @@ def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, se
 
     def outputs(seen):
         closing, speeds = 20.0 * seen[:, RAYS : 2 * RAYS], 20.0 * seen[:, 2 * RAYS if spec.motion else RAYS]
-        return outputs_of(spec, genome, 50.0 * seen[:, :RAYS], closing, speeds, 0.5 * seen[:, -1])
+        return outputs_of(spec, genome, 50.0 * seen[:, :RAYS], closing, speeds, 0.5 * seen[:, -1], SimConfig())
 
     one, other = outputs(observations), outputs(in_a_mirror(spec, observations))
     assert np.abs(one).max() > 0.1
@@ -280,7 +280,7 @@ def test_perceptrons_give_the_kernels_outputs(text, config):
     at = 2 * RAYS if spec.motion else RAYS
     expected = outputs_of(
         spec, genome, observations[:, :RAYS] * F(config.sensors.range), observations[:, RAYS:at] * speed,
-        observations[:, at] * speed, observations[:, -1] * angle,
+        observations[:, at] * speed, observations[:, -1] * angle, config,
     )  # fmt: skip
     close = {"rtol": 0.0, "atol": 5e-6 * np.abs(expected).max()}
     found = run(to_onnx(spec, genome, config), observation=observations)

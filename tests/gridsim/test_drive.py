@@ -19,6 +19,7 @@ from pictures import record_drive
 
 from cluster.commands.watch import drive_main
 from gridsim.car.vehicle import Action
+from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
@@ -68,7 +69,7 @@ def test_a_drive_that_is_begun_anew_in_traffic_replays_among_the_same_cars(scena
     shown: list[np.ndarray] = []
     pressed = iter([*[set()] * 5, {"r"}, *[set()] * 5, {"q"}])
     window: Any = SimpleNamespace(closed=False, keys=lambda: (next(pressed), {"up"}), show=lambda *_: None)
-    renderer: Any = SimpleNamespace(draw=lambda car, boxes, **_: shown.append(boxes))
+    renderer: Any = SimpleNamespace(config=SimConfig(), draw=lambda car, boxes, **_: shown.append(boxes))
     start = sample_starts(scenario, 1, np.random.default_rng(0))[0]
     with contextlib.closing(Recorder(tmp_path / "drive.csv", scenario, traffic=6)) as recorder:
         drive(scenario, start, window, renderer, recorder, traffic=6)

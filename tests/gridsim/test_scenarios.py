@@ -19,7 +19,7 @@ from gridsim.config import CROSSING_GAP
 from gridsim.jit import freeze
 from gridsim.maps.generators import curved, highway, roundabout
 from gridsim.maps.map import sample_starts
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, Strips, clearance_nodes, clearances
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, clearance_nodes, clearances
 from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.simulator import Simulator
 from gridsim.state import SPEED, End
@@ -177,8 +177,8 @@ blocks = st.tuples(inside, inside, st.floats(-7, 7), st.floats(0.5, 3.0), st.flo
 def test_nodes_are_exact_for_any_strips_and_blocks(lines, arcs, blocks):
     strips = Strips.of(lines, arcs, blocks)
     nodes = clearance_nodes(strips, SIDE, SIDE)
-    j, i = np.meshgrid(*[np.arange(0, round(SIDE * CELLS_PER_M), 3)] * 2, indexing="ij")
-    expected = oracle.ExactRoad(strips, SIDE, SIDE).clearance(np.column_stack([i.ravel(), j.ravel()]) / CELLS_PER_M)
+    j, i = np.meshgrid(*[np.arange(0, round(SIDE * CELLS_PER_UNIT), 3)] * 2, indexing="ij")
+    expected = oracle.ExactRoad(strips, SIDE, SIDE).clearance(np.column_stack([i.ravel(), j.ravel()]) / CELLS_PER_UNIT)
     assert nodes[j, i].ravel() == pytest.approx(np.maximum(expected, FIELD_FLOOR), abs=1e-4)
 
 
@@ -190,11 +190,11 @@ def test_the_field_is_the_exact_road(built):
         points = (lanes + rng.uniform(-9.0, 9.0, lanes.shape)).astype(F)
         true = exact.clearance(points)
         error = clearances(scenario.road, freeze(points))
-        error -= np.clip(true, FIELD_FLOOR, FIELD_FLOOR + 255 / FIELD_UNITS)
+        error -= np.clip(true, FIELD_FLOOR, FIELD_FLOOR + 255 / FIELD_STEPS)
         near = np.abs(true) < 0.5
         assert near.sum() > 300
         assert np.abs(error).max() < 0.4  # where a block's corner or two strips' edges meet in a point
-        assert np.quantile(np.abs(error[near]), 0.9) < 0.5 / FIELD_UNITS + 0.005
+        assert np.quantile(np.abs(error[near]), 0.9) < 0.5 / FIELD_STEPS + 0.005
         assert abs(error[near].mean()) < 0.01
 
 

@@ -305,7 +305,7 @@ class Books:
         self.distance += gained
         if self.interval[0] <= speed <= self.interval[1]:
             self.paced += gained
-        self.idle = self.idle + 1 if gained < self.episode.progress else 0
+        self.idle = self.idle + 1 if gained < self.episode.progress * self.episode.control_period else 0
 
 
 def drive(config, road, interval, start, actions, target, max_steps):
@@ -330,7 +330,7 @@ def drive(config, road, interval, start, actions, target, max_steps):
         rows.append((x, y, heading, speed, angle, books.distance, books.paced))
         if not on.all():
             end = "COLLISION"
-        elif books.idle >= config.episode.patience:
+        elif books.idle * config.episode.control_period >= config.episode.patience - 1e-9:
             end = "IDLE"
         elif books.distance >= target:
             end = "SUCCESS"

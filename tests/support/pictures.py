@@ -97,7 +97,7 @@ def cars_on(network, *rows):
 
 def record_drive(path, scenario, start, episodes):
     """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
-    simulator, states = manual(), []
+    simulator, states = manual(SimConfig()), []
     with closing(Recorder(path, scenario)) as recorder:
         for episode, actions in enumerate(episodes):
             simulator.reset(scenario, start[None])

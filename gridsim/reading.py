@@ -1,0 +1,57 @@
+"""Reading users' files: bytes, YAML and numbers, with errors in one line."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gridsim.errors import GridSimError
+
+MAX_BYTES = 1 << 27
+
+
+def shown(value: object) -> str:
+    """A value's repr, shortened to one line of at most 80 characters."""
+    text = " ".join(reprlib.repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's bytes; not those of a pipe or device, which may have no end, or of a file that is no map by its size."""
+    try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise GridSimError(f"{path} is not a regular file")
+        if path.is_file() and path.stat().st_size > MAX_BYTES:
+            raise GridSimError(f"{path}: more than {MAX_BYTES >> 20} MiB; make it smaller")
+        return path.read_bytes()
+    except OSError as error:
+        raise GridSimError(f"{path}: {error.strerror or error}") from None
+    except ValueError:
+        raise GridSimError(f"{shown(str(path))} is not a valid path") from None
+
+
+def read_yaml(path: Path) -> Any:
+    """The contents of a YAML file. Raises: GridSimError."""
+    text = read_bytes(path)
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # PyYAML raises many types of error on invalid input
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or shown(error)
+        raise GridSimError(f"{path}: not valid YAML{where}: {problem}") from None
+
+
+def number(value: Any, what: str, low: float, high: float, unit: str = "") -> float:
+    """A number within limits, also from text: YAML 1.1 reads 5e-2 as a string, ROS as a number."""
+    try:
+        found = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        found = math.nan
+    if not low <= found <= high:
+        raise GridSimError(f"{what} must be a number from {low:g} to {high:g}{unit and ' '}{unit}, not {shown(value)}")
+    return found
