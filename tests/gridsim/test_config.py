@@ -64,6 +64,7 @@ def test_a_file_gives_any_numbers_and_the_others_are_its_bases(tmp_path):
         ("base: f1tent", "unknown simulator 'f1tent'; did you mean f1tenth?"),
         ("vehicle: {length: long}", "vehicle.length must be a number from 0.2 to 30 m, not 'long'"),
         ("sensors: {rays: 31.5}", "sensors.rays must be a whole number, not 31.5"),
+        ("randomise: {width: 3}", "randomise is a mapping of names to [least, most], not {'width': 3}"),
     ],
 )
 def test_a_file_that_is_wrong_is_refused_in_a_line_that_names_it(tmp_path, text, said):
@@ -79,8 +80,8 @@ def test_a_file_that_is_wrong_is_refused_in_a_line_that_names_it(tmp_path, text,
 
 # --- Limits ----------------------------------------------------------------------------------------------------------
 
-PARTS = [f.name for f in dataclasses.fields(SimConfig)]
-NUMBERS = [(part, f.name) for part in PARTS for f in dataclasses.fields(getattr(DEFAULT, part))]
+FIELDS = [(part, f.name) for part in LIMITS for f in dataclasses.fields(getattr(DEFAULT, part))]
+NUMBERS = [(part, name) for part, name in FIELDS if not isinstance(getattr(getattr(DEFAULT, part), name), str)]
 
 
 @pytest.mark.parametrize(("part", "name"), NUMBERS)

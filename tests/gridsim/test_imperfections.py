@@ -114,8 +114,8 @@ def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> Non
 @pytest.mark.parametrize(
     ("randomise", "said"),
     [
-        ((("wings", 1.0, 2.0),), "unknown key randomise.wings"),
-        ((("model", 1.0, 2.0),), "unknown key randomise.model"),
+        ((("wings", 1.0, 2.0),), "unknown key randomise.'wings'"),
+        ((("model", 1.0, 2.0),), "unknown key randomise.'model'"),
         ((("width", 2.0, 1.0),), "randomise.width must be least and most, not 2 and 1"),
         ((("width", 0.0, 1.0),), "randomise.width must be "),
     ],

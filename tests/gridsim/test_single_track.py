@@ -75,6 +75,4 @@ def test_a_car_of_this_model_drives_and_slides_outwards_in_a_bend() -> None:
 def test_wrong_numbers_are_refused() -> None:
     for wrong, said in (({"model": "wheels"}, "kinematic or single_track"), ({"mass": 0.0}, "vehicle.mass must be ")):
         with pytest.raises(ValueError, match=said):
-            Simulator(1, SimConfig(VehicleConfig(**{**vars(SEDAN), **wrong}))).reset(
-                build("highway", 0), np.zeros((1, 5))
-            )
+            parameters(SimConfig(VehicleConfig(**{**vars(SEDAN), **wrong})))
