@@ -116,7 +116,7 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
     learner.curriculum = Curriculum(config, seed, maps.get, settings.traffic)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
-    learner.search = variant.search(learner.spec, search, seed)
+    learner.search = variant.search(learner.search.space, search, seed)
     found = []
     for budget in budgets:
         while learner.car_steps < 1e6 * budget:

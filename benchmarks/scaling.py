@@ -37,10 +37,11 @@ from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.threads import ThreadPool
 from cluster.workers.worker import Task, Worker
+from evolution.episodes import fitness
 from evolution.episodes.curriculum import Curriculum
 from evolution.episodes.rollout import EPISODE, RESULT
 from evolution.networks.policy import PolicySpec
-from evolution.search import fitness
+from evolution.networks.symmetry import space
 from evolution.search.base import SearchConfig
 from evolution.search.recombination import Recombination
 from gridsim.config import SimConfig
@@ -81,7 +82,7 @@ class Generations:
             settings.curriculum(), settings.seed, partial(build, settings.scenario), settings.traffic
         )
         self._curriculum.target = self._curriculum.config.last_target
-        self._search = Recombination(PolicySpec.parse(champion.policy), settings.search_config(), settings.seed)
+        self._search = Recombination(space(PolicySpec.parse(champion.policy)), settings.search_config(), settings.seed)
         self._search.start_from(champion.genome)
         self._search.sigma = SIGMA
         self.driven: list[tuple[Outcome, float]] = []  # and how long each took, s
@@ -121,7 +122,7 @@ def drive(settings: EvolveSettings, pools: list[WorkerPool], generations: int) -
 def children_per_s(children: int) -> float:
     """Members per second with two Ray workers that answer at once."""
     spec, config, groups = PolicySpec.parse("mlp:6,7"), SimConfig(), SearchConfig.groups
-    search = Recombination(spec, SearchConfig(population=children), 0)
+    search = Recombination(space(spec), SearchConfig(population=children), 0)
     episodes = np.zeros(2 * groups, EPISODE)
     episodes["target"], episodes["steps"] = 150.0, 245
     worlds, rates = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32), []

@@ -40,6 +40,7 @@ from cluster.store.checkpoint import CheckpointError
 from evolution.episodes.rollout import evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_size
+from evolution.networks.symmetry import space
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
 from gridsim.jit import njit
@@ -141,8 +142,8 @@ def breed_ms(runs: int, crossed: bool) -> float:
     else:
         recipes["kind"], recipes["seed"] = [Kind.STEP, Kind.MIRRORED] * 256, np.arange(512) // 2
     mutation = Mutation(rate=0.03)
-    breed(parents, recipes, 1, spec, mutation)
-    return 1e3 * median_s(lambda: breed(parents, recipes, 1, spec, mutation), 4 * runs)
+    breed(parents, recipes, 1, space(spec), mutation)
+    return 1e3 * median_s(lambda: breed(parents, recipes, 1, space(spec), mutation), 4 * runs)
 
 
 def new_map(scenario: str, runs: int) -> tuple[float, float]:

@@ -91,6 +91,8 @@ def test_every_package_that_is_imported_is_declared(root: Path) -> None:
     ("module", "banned"),
     [
         ("gridsim", {"numba", "torch"}),
+        ("evolution.search.recombination", {"evolution.networks", "evolution.episodes", "gridsim.car", "gridsim.maps"}),
+        ("evolution.search.two_parents", {"evolution.networks", "evolution.episodes", "gridsim.car", "gridsim.maps"}),
         ("cluster.workers.worker", {"ray", "torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}),
         ("cluster.workers.ray_pool", {"torch", "mlflow", "pygame", "matplotlib"}),
         ("cluster.commands.cli", {"torch", "mlflow", "pygame"}),

@@ -15,9 +15,10 @@ import numpy as np
 from cluster.learn.learning import Learning, Progress, State, named
 from cluster.settings import EvolveSettings
 from cluster.workers.pool import Chunk
+from evolution.episodes import fitness
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.figures import mean_speed
-from evolution.search import fitness
+from evolution.networks.symmetry import space
 from evolution.search.base import Search
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
@@ -45,9 +46,9 @@ class Evolution(Learning):
         s = self.settings
         self.search: Search
         if s.search == "random" or s.recombination == "two":
-            self.search = TwoParents(self.spec, s.search_config(), s.seed, random=s.search == "random")
+            self.search = TwoParents(space(self.spec), s.search_config(), s.seed, random=s.search == "random")
         else:
-            self.search = Recombination(self.spec, s.search_config(), s.seed)
+            self.search = Recombination(space(self.spec), s.search_config(), s.seed)
         if self.initial is not None:
             self.search.start_from(self.initial)
 

@@ -12,6 +12,7 @@ import numpy as np
 from evolution.dqn.experience import Experience
 from evolution.episodes.rollout import collect, evaluate
 from evolution.networks.policy import PolicySpec
+from evolution.networks.symmetry import space
 from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
@@ -73,7 +74,7 @@ class Worker:
     def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         """What `rollout.evaluate` returns for recipes RECIPE [n]."""
         spec = PolicySpec.parse(task.policy)
-        genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
+        genomes = breed(task.parents, recipes, task.key, space(spec), task.mutation)
         return evaluate(spec, genomes, maps, task.episodes, task.config, task.worlds)
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:

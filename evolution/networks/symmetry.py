@@ -9,11 +9,11 @@ serves in a bend to the right.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
-from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec
+from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec, gene_scales
+from evolution.search.space import Space, Symmetry
 from gridsim.car.vehicle import Action
 from gridsim.jit import freeze
 
@@ -26,13 +26,10 @@ MIRRORED_ACTIONS = np.array(
 )  # fmt: skip
 
 
-class Symmetry(NamedTuple):
-    """How the genes of a symmetric network depend on each other: gene[bound] = factor * gene[source]."""
-
-    free: np.ndarray  # int32 [f], genes with random numbers of their own
-    bound: np.ndarray  # int32 [genes - f], all other genes
-    source: np.ndarray  # int32 [genes - f], the mirror image of each bound gene: a free gene, unless the factor is 0
-    factor: np.ndarray  # float32 [genes - f]: 1; -1 for weights of the steering angle, 0 for that of a middle unit
+@cache
+def space(spec: PolicySpec) -> Space:
+    """The space of a network's genomes, as searches know it."""
+    return Space(spec.size, gene_scales(spec), symmetry(spec))
 
 
 @cache
@@ -41,6 +38,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
     With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
     all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
+    Factors are 1, but -1 for weights of the steering angle, and 0 for that of a middle unit.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()

@@ -1,1 +1,1 @@
-"""Searches (ask and tell): recombination of all winners, two parents; breeding from recipes; fitness."""
+"""Searches (ask and tell): recombination of all winners, two parents; breeding from recipes; spaces."""

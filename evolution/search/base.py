@@ -9,8 +9,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation, breed
+from evolution.search.space import Space
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class SearchConfig:
     population: int = 256  # members of a generation
     groups: int = 8  # of members; each group has its own episodes
     tournament: int = 4  # members of a tournament
-    sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
+    sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of the space's scales
     elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate
 
@@ -48,8 +48,8 @@ class Search(ABC):
 
     kept: ClassVar[tuple[str, ...]]  # attributes that make up the state, besides the generation
 
-    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
-        self.spec, self.config, self.seed = spec, config, seed
+    def __init__(self, space: Space, config: SearchConfig, seed: int):
+        self.space, self.config, self.seed = space, config, seed
         self.generation = 0  # completed generations
         self.asked: Generation  # the current generation
         self.champion: np.ndarray | None = None  # the run's, float32 [genes], for searches with it as an elite
@@ -87,10 +87,10 @@ class Search(ABC):
         self._tell(self.asked, np.where(np.isnan(scores), -np.inf, scores))
         self.generation += 1
 
-    def genomes(self, members: np.ndarray) -> np.ndarray:
-        """Genomes float32 [k, genes] of members [k] of the current generation."""
+    def genomes(self, members: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Genomes float32 [k, genes] of members [k] of the current generation, by default of all."""
         asked = self.asked
-        return breed(asked.parents, asked.recipes[members], asked.key, self.spec, asked.mutation)
+        return breed(asked.parents, asked.recipes[members], asked.key, self.space, asked.mutation)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, self.generation, purpose]))

@@ -12,8 +12,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from evolution.networks.policy import PolicySpec, gene_scales
-from evolution.networks.symmetry import symmetry
+from evolution.search.space import Space
 from gridsim.counter import GOLDEN, mix
 from gridsim.jit import F, U, freeze, njit
 
@@ -22,10 +21,10 @@ class Kind(IntEnum):
     """How a child is made from the rows a and b of `parents` in its recipe."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP and MIRRORED
+    NEW = 1  # a random genome, symmetric (`space.Symmetry`), like the noise of STEP and MIRRORED
     STEP = 2  # parents[a], and noise in each gene
     MIRRORED = 3  # parents[a], less that noise: with the same seed, the opposite of a STEP
-    CROSS = 4  # uniform crossover of parents[a] and parents[b], then mutation of some genes
+    CROSS = 4  # uniform crossover of parents[a] and parents[b], then mutation of some genes; as symmetric as both are
 
 
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
@@ -46,7 +45,7 @@ class Mutation:
     """Gaussian mutation."""
 
     rate: float = 0.03  # share of genes that get noise, in a child of two parents
-    sigma: float = 0.5  # its standard deviation, in units of `policy.gene_scales`
+    sigma: float = 0.5  # its standard deviation, in units of the space's scales
 
 
 @njit
@@ -57,7 +56,7 @@ def _stream(key, seed):
 
 @njit
 def _normals(quantiles, stream, scale, symmetry, out):
-    """out[i] = scale[i] * N(0, 1), left-right symmetric; four numbers from each 64 random bits."""
+    """out[i] = scale[i] * N(0, 1), symmetric; four numbers from each 64 random bits."""
     n = out.shape[0]
     for block in range(n // 4):
         bits = mix(stream + U(block + 1) * GOLDEN)
@@ -74,10 +73,13 @@ def _normals(quantiles, stream, scale, symmetry, out):
 
 
 @njit
-def _cross(a, b, stream, threshold, child, marked):
-    """Uniform crossover, and marks of the genes to mutate. Without branches, so that it is vectorised."""
+def _cross(a, b, stream, threshold, source, child, marked):
+    """Uniform crossover, and marks of the genes to mutate, a bound gene as its source (`space.Symmetry`).
+
+    Without branches, so that it is vectorised.
+    """
     for i in range(child.shape[0]):
-        bits = mix(stream + U(i + 1) * GOLDEN)
+        bits = mix(stream + (source[i] + U(1)) * GOLDEN)
         x, y = a[i], b[i]
         child[i] = y if bits & U(1) else x
         marked[i] = (bits >> U(40)) < threshold
@@ -85,10 +87,13 @@ def _cross(a, b, stream, threshold, child, marked):
 
 @njit(nogil=True)
 def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, children):
-    """Children of recipes; scales [genes] are `policy.gene_scales`."""
+    """Children of recipes; scales [genes] are the space's."""
     genes = children.shape[1]
     threshold = U(rate * F(1 << 24))
     marked = np.empty(genes, dtype=np.uint8)
+    source, factor = np.arange(genes).astype(np.uint64), np.ones(genes, dtype=np.float32)
+    for k in range(symmetry.bound.shape[0]):
+        source[symmetry.bound[k]], factor[symmetry.bound[k]] = symmetry.source[k], symmetry.factor[k]
     for n in range(recipes.shape[0]):
         recipe = recipes[n]
         kind, child = recipe["kind"], children[n]
@@ -105,20 +110,20 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
             for i in range(genes):
                 child[i] = a[i] + size * child[i]
         else:
-            _cross(a, b, stream, threshold, child, marked)
+            _cross(a, b, stream, threshold, source, child, marked)
             for i in range(genes):
                 if marked[i]:
-                    bits = mix(mix(stream + U(i + 1) * GOLDEN))
-                    child[i] += sigma * scales[i] * quantiles[bits & U(0xFFF)]
+                    bits = mix(mix(stream + (source[i] + U(1)) * GOLDEN))
+                    child[i] += factor[i] * sigma * scales[i] * quantiles[bits & U(0xFFF)]
 
 
-def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, mutation: Mutation) -> np.ndarray:
+def breed(parents: np.ndarray, recipes: np.ndarray, key: int, space: Space, mutation: Mutation) -> np.ndarray:
     """Children float32 [n, genes] of recipes RECIPE [n] over parents float32 [p, genes]."""
     if not len(parents):  # all are Kind.NEW
-        parents = np.zeros((1, spec.size), dtype=np.float32)
-    children = np.empty((len(recipes), spec.size), dtype=np.float32)
+        parents = np.zeros((1, space.size), dtype=np.float32)
+    children = np.empty((len(recipes), space.size), dtype=np.float32)
     _breed(
-        freeze(parents), freeze(recipes), U(key), gene_scales(spec), symmetry(spec), QUANTILES,
+        freeze(parents), freeze(recipes), U(key), space.scales, space.symmetry, QUANTILES,
         F(mutation.rate), F(mutation.sigma), children,
     )  # fmt: skip
     return children
@@ -137,8 +142,8 @@ def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
             total[i] += w * z[i]
 
 
-def noise_sum(seeds: np.ndarray, weights: np.ndarray, key: int, spec: PolicySpec) -> np.ndarray:
+def noise_sum(seeds: np.ndarray, weights: np.ndarray, key: int, space: Space) -> np.ndarray:
     """Sum float32 [genes] of weights [n] times the noise of Kind.STEP at sigma 1 with these seeds [n]."""
-    total = np.zeros(spec.size, dtype=np.float32)
-    _noise_sum(seeds.astype(np.uint32), weights, U(key), QUANTILES, gene_scales(spec), symmetry(spec), total)
+    total = np.zeros(space.size, dtype=np.float32)
+    _noise_sum(seeds.astype(np.uint32), weights, U(key), QUANTILES, space.scales, space.symmetry, total)
     return total

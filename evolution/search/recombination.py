@@ -1,7 +1,7 @@
 """The default search: tournament winners are recombined into one centre, around which the next generation is sampled.
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
-adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). Children come in mirrored pairs
+adaptation (Hansen and Ostermeier 2001). Noise is symmetric (`space.Symmetry`). Children come in mirrored pairs
 (Brockhoff et al. 2010), the centre plus and minus the same noise, which drive the same episodes. The elites are
 the centre and the champion (at first, the average of centres). They are evaluated unmodified, and can win like others.
 """
@@ -12,10 +12,9 @@ import math
 
 import numpy as np
 
-from evolution.networks.policy import PolicySpec, gene_scales
-from evolution.networks.symmetry import symmetry
 from evolution.search.base import Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
 from evolution.search.breeding import Kind, Mutation, noise_sum
+from evolution.search.space import Space
 
 _CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
 _ELITES = 2  # the centre, and the champion or, before the first one, the average
@@ -27,15 +26,15 @@ _MAX_GROWTH = 2.0
 
 
 class Recombination(Search):
-    """Children are centre + sigma * scales * N(0, 1), see `gene_scales`; the first generation is random."""
+    """Children are centre + sigma * scales * N(0, 1); the first generation is random."""
 
     kept = ("centre", "average", "path", "sigma")
 
-    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
-        super().__init__(spec, config, seed)
+    def __init__(self, space: Space, config: SearchConfig, seed: int):
+        super().__init__(space, config, seed)
         self.centre = np.zeros(0)  # float64 [genes], or [0] before the first generation
         self.average = np.zeros(0)  # exponential moving average of the centres
-        self._free = symmetry(spec).free
+        self._free = space.symmetry.free
         # The evolution path starts at its stationary N(0, I), not at 0, which would shrink sigma at first.
         self.path = self._rng(1).standard_normal(len(self._free))
         self.sigma = config.sigma  # the step size
@@ -52,7 +51,7 @@ class Recombination(Search):
         made = recipes(n)
         if not len(self.centre):
             made["kind"] = Kind.NEW
-            none = np.zeros((0, self.spec.size), dtype=np.float32)
+            none = np.zeros((0, self.space.size), dtype=np.float32)
             return Generation(none, made, key, Mutation(), split(n, self.config.groups))
         other = self.average if self.champion is None else self.champion
         rows = np.stack([self.centre, other]).astype(np.float32)
@@ -73,7 +72,7 @@ class Recombination(Search):
         pairs = (len(weights) - _ELITES) // 2  # an odd last member, without a mirror image, is left out
         plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
         genes, shift = len(self._free), plus - minus
-        noise = noise_sum(np.arange(pairs), shift, asked.key, self.spec)
+        noise = noise_sum(np.arange(pairs), shift, asked.key, self.space)
         towards = self.sigma * noise + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.centre = self.centre + _LEARNING_RATE * towards
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
@@ -83,7 +82,7 @@ class Recombination(Search):
             rate = (effective + 2.0) / (genes + effective + 5.0)
             damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
             expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
-            step = (noise / gene_scales(self.spec))[self._free] / norm
+            step = (noise / self.space.scales)[self._free] / norm
             self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) * step
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
             self.sigma = min(self.sigma, _MAX_GROWTH * self.config.sigma)

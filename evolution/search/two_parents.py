@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, Search, SearchConfig, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
+from evolution.search.space import Space
 
 PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
 
@@ -19,10 +19,10 @@ class TwoParents(Search):
 
     kept = ("parents", "elites")
 
-    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int, random: bool = False):
-        super().__init__(spec, config, seed)
+    def __init__(self, space: Space, config: SearchConfig, seed: int, random: bool = False):
+        super().__init__(space, config, seed)
         self.random = random
-        self.parents = np.zeros((0, spec.size), dtype=np.float32)  # elites, the best first, then the mating pool
+        self.parents = np.zeros((0, space.size), dtype=np.float32)  # elites, the best first, then the mating pool
         self.elites = 0  # rows of `parents` that are elites
 
     def start_from(self, genome: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Searches: children from recipes, fitness, ranks, tournaments, the (CSA-)ES beside CMA-ES, the genetic algorithm."""
+"""Searches: children from recipes, ranks, tournaments, the (CSA-)ES beside CMA-ES, the genetic algorithm."""
 
 import itertools
 
@@ -9,18 +9,18 @@ from hypothesis import strategies as st
 from scipy import stats
 from searching import first_gene, new_genomes, state_of, told
 
-from evolution.episodes.rollout import RESULT
-from evolution.networks.policy import PolicySpec, gene_scales
-from evolution.networks.symmetry import symmetry
+from evolution.networks.policy import PolicySpec
+from evolution.networks.symmetry import space
 from evolution.search.base import SearchConfig, ranks, split, tournament_weights, tournaments
 from evolution.search.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, noise_sum
-from evolution.search.fitness import PACED_ENOUGH, scalar
 from evolution.search.recombination import Recombination
+from evolution.search.space import Space, Symmetry
 from evolution.search.two_parents import PARENTS, TwoParents
+from gridsim.errors import GridSimError
 
 F = np.float32
-SPEC = PolicySpec.parse("mlp:1")
-GENES = SPEC.size  # 49
+GENES = 49
+SPACE = Space(GENES, np.ones(GENES))
 SEARCHES = [Recombination, TwoParents]
 few = st.integers(0, 4)  # scores that are often equal
 
@@ -57,6 +57,22 @@ def test_tournaments_are_won_at_their_weights(n, size):
     assert stats.chisquare(seen, count * tournament_weights(scores, size)).pvalue > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("scales", "mirror"),
+    [
+        (np.ones(2), None),
+        (np.array([1.0, 0.0, 1.0]), None),
+        (np.array([1.0, np.nan, 1.0]), None),
+        (np.ones(3), Symmetry(*map(np.array, ([0, 1], [1], [0], [1.0])))),  # gene 2 is missing
+        (np.ones(3), Symmetry(*map(np.array, ([0, 1], [2], [3], [1.0])))),
+        (np.ones(3), Symmetry(*map(np.array, ([0, 1], [2], [0], [1.0, 1.0])))),
+    ],
+)
+def test_a_space_that_does_not_fit_its_size_is_refused(scales, mirror):
+    with pytest.raises(GridSimError, match=r"^[^\n]*a space of 3 genes[^\n]*$"):
+        Space(3, scales, mirror)
+
+
 @given(data=st.data())
 def test_pairs_stay_together_in_groups_of_about_as_many(data):
     members = data.draw(st.integers(4, 300))
@@ -73,7 +89,7 @@ def test_pairs_stay_together_in_groups_of_about_as_many(data):
 
 @pytest.mark.parametrize("kind", SEARCHES)
 def test_the_first_generation_is_new_and_each_has_a_key_of_its_own(kind):
-    search, other = (kind(SPEC, SearchConfig(population=41, groups=3), seed) for seed in (4, 5))
+    search, other = (kind(SPACE, SearchConfig(population=41, groups=3), seed) for seed in (4, 5))
     assert search.leader() is None
     asked = search.ask()
     assert asked.groups == split(41, 3)
@@ -89,7 +105,7 @@ def test_the_first_generation_is_new_and_each_has_a_key_of_its_own(kind):
 def test_a_score_that_is_not_a_number_loses(kind):
     states = []
     for spoilt in (np.nan, -np.inf, -1e300):
-        search = kind(SPEC, SearchConfig(population=16, groups=2, tournament=4), seed=6)
+        search = kind(SPACE, SearchConfig(population=16, groups=2, tournament=4), seed=6)
         for generation in range(4):
             search.ask()
             scores = np.random.default_rng(generation).normal(size=16)
@@ -99,64 +115,17 @@ def test_a_score_that_is_not_a_number_loses(kind):
     assert states[0] == states[1] == states[2]
 
 
-# --- Fitness ---------------------------------------------------------------------------------------------------------
-
-TARGET = 500.0
-
-
-def results(distance, paced):
-    """RESULT [n, e] of distances and paced distances [n, e]."""
-    made = np.zeros(np.shape(distance), dtype=RESULT)
-    made["distance"], made["paced"] = distance, paced
-    return made
-
-
-def worth(*drives):
-    """The fitness of members with one episode each, given as (metres, paced metres)."""
-    distance, paced = np.array(drives, dtype=float).T[:, :, None]
-    return scalar(results(distance, paced), TARGET).tolist()
-
-
-metres = st.floats(0.0, 1000.0, width=32)
-episodes = st.lists(st.tuples(metres, st.floats(0.0, 1.0)), min_size=1, max_size=6)  # distance, share that was paced
-
-
-@given(drives=episodes, which=st.integers(0, 5), more=st.floats(0.5, 100.0))
-def test_further_and_better_paced_is_never_worse(drives, which, more):
-    row = results([[d for d, _ in drives]], [[d * share for d, share in drives]])
-    further, paced = row.copy(), row.copy()
-    k = which % len(drives)
-    further["distance"][0, k] += more
-    paced["paced"][0, k] += more
-    for better in (further, paced):
-        assert scalar(better, TARGET)[0] >= scalar(row, TARGET)[0]
-    if further["distance"][0, k] < TARGET:
-        assert scalar(further, TARGET)[0] > scalar(row, TARGET)[0]
-        if paced["paced"][0, k] < PACED_ENOUGH * row["distance"][0, k]:
-            assert scalar(paced, TARGET)[0] > scalar(row, TARGET)[0]
-
-
-def test_what_metres_are_worth():
-    assert worth((0, 0), (TARGET, TARGET), (3 * TARGET, 3 * TARGET)) == pytest.approx([0.0, 1.0, 1.0], abs=0.0)
-    nothing, first_bend, far, further = worth((0, 0), (20, 20), (400, 400), (420, 420))
-    assert first_bend - nothing > 5 * (further - far)
-    unpaced, paced = worth((400, 0), (120, 120))  # 0.7 of the score is for paced metres, 0.3 for all
-    assert unpaced == pytest.approx(paced)
-    whole, enough, less = worth((400, 400), (400, 320), (400, 310))  # a fifth may be outside the interval
-    assert whole == enough > less
-
-
 # --- The default search ----------------------------------------------------------------------------------------------
 
 
 def begun(config, seed=1):
-    search = Recombination(SPEC, config, seed)
+    search = Recombination(SPACE, config, seed)
     search.start_from(np.random.default_rng(seed).normal(size=GENES).astype(F))
     return search
 
 
 def test_the_first_centre_is_the_best_of_a_random_generation():
-    search = Recombination(SPEC, SearchConfig(population=40, groups=4), seed=1)
+    search = Recombination(SPACE, SearchConfig(population=40, groups=4), seed=1)
     members = told(search, first_gene)
     assert np.asarray(search.leader()).tobytes() == members[first_gene(members).argmax()].tobytes()
     assert search.sigma == search.config.sigma
@@ -254,7 +223,7 @@ EVERYONE = np.arange(CONFIG.population)
 
 @pytest.mark.parametrize(("random", "kind"), [(False, Kind.CROSS), (True, Kind.NEW)])
 def test_elites_go_on_bit_identical_best_first(random, kind):
-    search = TwoParents(SPEC, CONFIG, seed=1, random=random)
+    search = TwoParents(SPACE, CONFIG, seed=1, random=random)
     before = told(search, first_gene)
     for _ in range(5):
         best = np.argsort(-first_gene(before), kind="stable")[: CONFIG.elites]
@@ -270,7 +239,7 @@ def test_elites_go_on_bit_identical_best_first(random, kind):
 
 def test_elites_are_the_best_of_their_groups():
     """A group that met easier episodes has no more of them."""
-    search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=3, elites=8), seed=1)
+    search = TwoParents(SPACE, SearchConfig(population=40, groups=4, tournament=3, elites=8), seed=1)
     asked = search.ask()
     members = search.genomes(EVERYONE)
     scores = first_gene(members) + 100.0 * np.repeat(np.arange(4), 10)
@@ -282,7 +251,7 @@ def test_elites_are_the_best_of_their_groups():
 
 def test_both_parents_come_from_the_pool_and_mutation_is_as_asked_for():
     config = SearchConfig(population=4000, groups=1, tournament=2, elites=3, sigma=0.7, mutation_rate=0.2)
-    search = TwoParents(SPEC, config, seed=5)
+    search = TwoParents(SPACE, config, seed=5)
     told(search, first_gene)
     assert len(search.parents) == PARENTS + 3
     asked = search.ask()
@@ -296,8 +265,8 @@ def test_both_parents_come_from_the_pool_and_mutation_is_as_asked_for():
 
 @pytest.mark.parametrize("elites", [0, 4])
 def test_a_search_that_starts_from_a_genome_breeds_from_it(elites):
-    search = TwoParents(SPEC, SearchConfig(population=40, elites=elites, mutation_rate=0.0), seed=1)
-    genome = new_genomes(SPEC)[0]
+    search = TwoParents(SPACE, SearchConfig(population=40, elites=elites, mutation_rate=0.0), seed=1)
+    genome = np.random.default_rng(1).normal(size=GENES).astype(F)
     search.start_from(genome)
     search.ask()
     assert (search.genomes(EVERYONE) == genome).all()
@@ -307,7 +276,7 @@ def test_a_search_that_starts_from_a_genome_breeds_from_it(elites):
 
 
 MLP, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")
-FREE = symmetry(MLP).free  # genes with noise of their own
+FREE = space(MLP).symmetry.free  # genes with noise of their own
 STILL = Mutation(rate=0.0, sigma=0.0)
 
 
@@ -331,14 +300,14 @@ def test_a_copy_is_bit_identical(parents):
     odd = parents.copy()
     odd[2, :4] = [-0.0, np.inf, 1e-42, -np.inf]
     odd[2, 4] = np.array([0x7FC12345], dtype=np.uint32).view(F)[0]  # a not-a-number of its own
-    children = breed(odd, np.array([(0, 2, 1, 0), (0, 0, 2, 9)], dtype=RECIPE), 9, MLP, Mutation(rate=1.0))
+    children = breed(odd, np.array([(0, 2, 1, 0), (0, 0, 2, 9)], dtype=RECIPE), 9, space(MLP), Mutation(rate=1.0))
     assert children.tobytes() == odd[[2, 0]].tobytes()
 
 
 @pytest.mark.parametrize("spec", [MLP, CNN, PolicySpec.parse("mlp:3+motion")], ids=str)
 def test_new_genomes_are_normal_and_as_large_as_genes_are(spec):
     n = 600
-    noise = new_genomes(spec, n, seed=1) / gene_scales(spec).astype(float)
+    noise = new_genomes(spec, n, seed=1) / space(spec).scales.astype(float)
     for part in np.array_split(np.arange(spec.size), 8):
         assert noise[:, part].mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(n * len(part)))
         assert noise[:, part].std() == pytest.approx(1.0, abs=4.0 / np.sqrt(n * len(part)))
@@ -359,33 +328,44 @@ def test_a_step_is_the_centre_and_its_seed_s_noise_at_the_scale_of_each_gene(spe
     centre, made, weights = rng.normal(size=(1, spec.size)).astype(F), many(Kind.STEP, 0, 0, 30), rng.normal(size=30)
     made["seed"] = rng.integers(1 << 32, size=30)
     weights[[3, 5]] = 0.0
-    z = breed(np.zeros_like(centre), made, 99, spec, Mutation(sigma=1.0)).astype(float)
-    assert is_normal((z / gene_scales(spec))[:, symmetry(spec).free])
-    np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre + 0.25 * z, atol=1e-6)
-    np.testing.assert_allclose(noise_sum(made["seed"], weights, 99, spec), weights @ z, atol=3e-5)
+    z = breed(np.zeros_like(centre), made, 99, space(spec), Mutation(sigma=1.0)).astype(float)
+    assert is_normal((z / space(spec).scales)[:, space(spec).symmetry.free])
+    np.testing.assert_allclose(breed(centre, made, 99, space(spec), Mutation(sigma=0.25)), centre + 0.25 * z, atol=1e-6)
+    np.testing.assert_allclose(noise_sum(made["seed"], weights, 99, space(spec)), weights @ z, atol=3e-5)
     made["kind"] = Kind.MIRRORED
-    np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre - 0.25 * z, atol=1e-6)
+    np.testing.assert_allclose(breed(centre, made, 99, space(spec), Mutation(sigma=0.25)), centre - 0.25 * z, atol=1e-6)
 
 
 def test_a_child_of_two_has_each_gene_of_one_of_both(parents):
-    children = breed(parents, many(Kind.CROSS, 1, 4, 2000), 77, MLP, STILL)
+    children = breed(parents, many(Kind.CROSS, 1, 4, 2000), 77, space(MLP), STILL)
     from_a, from_b = children == parents[1], children == parents[4]
     assert (from_a ^ from_b).all()
+    from_b = from_b[:, FREE]  # the other genes come from where these do
     assert abs(from_b.mean() - 0.5) < 4 * 0.5 / np.sqrt(from_b.size)
     # Every gene and every child has about half of each; neighbouring genes are inherited independently.
     assert np.abs(from_b.mean(axis=0) - 0.5).max() < 5 * 0.5 / np.sqrt(2000)
-    assert np.abs(from_b.mean(axis=1) - 0.5).max() < 5 * 0.5 / np.sqrt(MLP.size)
+    assert np.abs(from_b.mean(axis=1) - 0.5).max() < 5 * 0.5 / np.sqrt(len(FREE))
     assert abs((from_b[:, 1:] == from_b[:, :-1]).mean() - 0.5) < 4 * 0.5 / np.sqrt(from_b.size)
 
 
 @pytest.mark.parametrize(("rate", "sigma"), [(0.03, 0.5), (0.2, 2.0), (1.0, 1.0)])
 def test_mutation_is_gaussian_at_its_rate(rate, sigma):
     zero = np.zeros((1, MLP.size), dtype=F)
-    children = breed(zero, many(Kind.CROSS, 0, 0, 2000), 4, MLP, Mutation(rate=rate, sigma=sigma))
+    children = breed(zero, many(Kind.CROSS, 0, 0, 2000), 4, space(MLP), Mutation(rate=rate, sigma=sigma))[:, FREE]
     changed = children != 0.0
     assert abs(changed.mean() - rate) < 4 * np.sqrt(rate * (1 - rate) / changed.size) + 1e-6
     assert np.abs(changed.mean(axis=0) - rate).max() < 5 * np.sqrt(rate * (1 - rate) / 2000) + 1e-6
     assert is_normal(children[changed][:20_000].astype(float) / sigma)
+
+
+def test_children_of_symmetric_parents_are_symmetric():
+    """Bit for bit; the steering angle's weights have the other sign, or are 0 in a middle unit."""
+    spec = PolicySpec.parse("mlp:7+steering")
+    bound, source, factor = space(spec).symmetry[1:]
+    children = breed(new_genomes(spec, 5), many(Kind.CROSS, 1, 4, 500), 3, space(spec), Mutation(rate=0.1))
+    assert {*factor} == {1.0, -1.0, 0.0}
+    assert (children[:, bound] == factor * children[:, source]).all()
+    assert len(np.unique(children, axis=0)) == 500
 
 
 @settings(max_examples=30, derandomize=True)
@@ -396,6 +376,6 @@ def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data)
         many(Kind.COPY, 0, 0, 2),
     ])  # fmt: skip
     key = data.draw(st.integers(0, 2**63 - 1))
-    whole = breed(parents, made, key, MLP, Mutation(rate=0.1))
+    whole = breed(parents, made, key, space(MLP), Mutation(rate=0.1))
     chosen = data.draw(st.lists(st.integers(0, len(made) - 1), min_size=1, max_size=20))
-    assert breed(parents, made[chosen], key, MLP, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()
+    assert breed(parents, made[chosen], key, space(MLP), Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()

@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from evolution.networks.symmetry import space
 from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 
 
 def told(search, score):
     """One generation: asked for, and told `score(genomes)`; returns the genomes."""
     search.ask()
-    genomes = search.genomes(np.arange(search.config.population))
+    genomes = search.genomes()
     search.tell(score(genomes))
     return genomes
 
@@ -28,4 +29,4 @@ def first_gene(genomes):
 def new_genomes(spec, n=1, seed=0):
     recipes = np.zeros(n, dtype=RECIPE)
     recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
-    return breed(np.zeros((0, spec.size), dtype=np.float32), recipes, seed, spec, Mutation())
+    return breed(np.zeros((0, spec.size), dtype=np.float32), recipes, seed, space(spec), Mutation())
