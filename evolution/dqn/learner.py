@@ -16,7 +16,8 @@ The result depends only on the seed, the parameters and the replay's contents, b
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -89,6 +90,17 @@ def device_of(name: str) -> torch.device:
     if not torch.cuda.is_available():
         raise GridSimError(f"PyTorch finds no device {name!r} here; use --device cpu")
     return torch.device("cuda", 0)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have PyTorch use one thread: results depend on their number, and the workers use the other cores."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @njit(nogil=True)
@@ -170,8 +182,6 @@ class DqnLearner:
     """
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
-        # For the whole process: results depend on the number of threads, and the workers use the other cores.
-        torch.set_num_threads(1)
         self.spec, self.config = spec, config
         self.device = device_of(device)
         self.updates = 0
@@ -243,6 +253,7 @@ class DqnLearner:
             self.target.genome.copy_(self.online.genome)
         return loss.item(), q.mean().item()
 
+    @one_thread()
     def train(self, replay: Replay, updates: int) -> tuple[float, float]:
         """Make updates from a replay; several calls give the same result as one. Returns: mean loss and mean value.
 
@@ -255,6 +266,7 @@ class DqnLearner:
         loss, q = np.mean(made, axis=0)
         return float(loss), float(q)
 
+    @one_thread()
     def q_values(self, observations: np.ndarray) -> np.ndarray:
         """Values float32 [n, outputs] of the actions for the network's inputs float32 [n, inputs]."""
         with torch.no_grad():

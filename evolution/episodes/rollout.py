@@ -183,6 +183,10 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
     end, steps, before = 0, 0, F(0.0)
+    if keep > 0:  # an episode may end without a step
+        _copy(car, workspace.ring[0])
+        if world is not None:
+            _copy_world(world, workspace.world_ring[0])
     while True:
         if recorder is None and end != 0:
             break

@@ -11,6 +11,7 @@ import numpy as np
 
 from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 from evolution.search.space import Space
+from gridsim.errors import GridSimError
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,13 @@ class Search(ABC):
 
 
 def split(members: int, groups: int, first: int = 0) -> list[slice]:
-    """Split members into groups of about equal size, without splitting pairs; pairs begin after the `first` members."""
+    """Split members into groups of about equal size, without splitting pairs; pairs begin after the `first` members.
+
+    Raises: GridSimError if a group would have no pair.
+    """
     pairs = (members - first + 1) // 2
+    if pairs < groups:
+        raise GridSimError(f"{groups} groups need a population of {first + 2 * groups - 1} or more, not {members}")
     bounds = first + 2 * np.round(np.linspace(0, pairs, groups + 1)).astype(int)
     bounds[0], bounds[-1] = 0, members
     return [slice(a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)]

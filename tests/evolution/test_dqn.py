@@ -230,6 +230,23 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
         assert np.array_equal(learner.state()["target"], target)
 
 
+def test_it_works_in_one_thread_and_the_processs_own_number_stays(monkeypatch):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        learner = learner_of()
+        monkeypatch.setattr(learner, "update", lambda batch: (float(torch.get_num_threads()),) * 2)
+        monkeypatch.setattr(learner, "online", lambda x: torch.tensor(torch.get_num_threads()))
+        replay = Replay(SPEC, 10, 0.9)
+        columns = (np.array([0, NO_ACTION], dtype=np.uint8), np.zeros(2, dtype=F), np.array([End.IDLE, 0], np.uint8))
+        replay.add(Experience(np.zeros((2, 32), dtype=np.int16), *columns))
+        assert learner.q_values(np.zeros((1, 32), dtype=F)) == 1
+        assert learner.train(replay, 2) == (1.0, 1.0)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_a_chain_of_two_states_is_learned():
     """State A: action 1 leads to B, all others stay. State B: action 0 ends with reward 1, all others lead back to A.
 

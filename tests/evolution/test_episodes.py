@@ -79,10 +79,15 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
         assert simulator.ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
 
+def as_start(car):
+    """About the start, as in EPISODE, of a car's state."""
+    return pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
+
+
 def test_what_is_rewound_goes_on_as_it_did(among):
     """Car and world of so many steps before the end, or of the start, which change no result, end alike once more."""
     spec, genome, maps, episodes, worlds, paths = among
-    both = np.stack([genome, np.zeros_like(genome)])
+    both = np.stack([genome, np.full_like(genome, np.nan)])  # whose episodes end before their first step
     plain, starts, then = evaluate(spec, both, maps, episodes, CONFIG, worlds)
     assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
     crashed = [int(row["end"]) == End.COLLISION for row, _, _ in paths]
@@ -92,13 +97,15 @@ def test_what_is_rewound_goes_on_as_it_did(among):
     assert results.tobytes() == plain.tobytes()
     kept = np.flatnonzero(wanted["rewind"])
     assert (starts.shape, then.shape) == ((2, len(kept), 5), (2, len(kept), *worlds.shape[1:]))
+    for start, world, k in zip(starts[1], then[1], kept, strict=True):
+        assert start == as_start(paths[k][1][0])
+        assert world.tobytes() == worlds[k].tobytes()
     for start, world, k in zip(starts[0], then[0], kept, strict=True):
         row, states, traffic = paths[k]
         last = int(row["steps"])
         first = max(last - int(wanted["rewind"][k]), 0)
-        car = states[first]
         assert world.tobytes() == traffic[first].tobytes()
-        assert start == pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
+        assert start == as_start(states[first])
         if not crashed[k]:
             continue
         original, again = (Simulator(1, CONFIG, TARGET, STEPS, traffic=CARS) for _ in range(2))

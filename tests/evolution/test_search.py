@@ -76,15 +76,22 @@ def test_a_space_that_does_not_fit_its_size_is_refused(scales, mirror):
 @given(data=st.data())
 def test_pairs_stay_together_in_groups_of_about_as_many(data):
     members = data.draw(st.integers(4, 300))
-    groups = data.draw(st.integers(1, members // 2))
     first = data.draw(st.integers(0, 2))
+    groups = data.draw(st.integers(1, (members - first + 1) // 2))
     parts = split(members, groups, first)
     assert len(parts) == groups
+    assert all(part.start < part.stop for part in parts)
     assert [k for part in parts for k in range(part.start, part.stop)] == list(range(members))
     assert all((part.start - first) % 2 == 0 for part in parts[1:])  # no pair is cut
     sizes = np.array([part.stop - part.start for part in parts])
     sizes[0] -= first
     assert np.ptp((sizes + 1) // 2) <= 1
+
+
+def test_a_population_too_small_for_its_groups_is_refused():
+    assert len(split(17, 8, 2)) == 8
+    with pytest.raises(GridSimError, match=r"^8 groups need a population of 17 or more, not 16$"):
+        split(16, 8, 2)
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
