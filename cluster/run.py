@@ -200,7 +200,6 @@ class Session:
     def finish(self) -> None:
         """Choose the champion, measure it on held-out drives, and write the remaining files."""
         from cluster.report.report import write_report
-        from evolution.networks.export import to_onnx
 
         learning, path, settings = self.learning, self.run.path, self.run.settings
         self.maps.ahead(HELD_OUT_SEEDS)
@@ -209,7 +208,7 @@ class Session:
         assert best is not None
         champion = Champion(best.genome, settings.policy, settings.scenario, sim, settings.traffic)
         champion.save(path / CHAMPION)
-        checkpoint.write_atomic(path / ONNX, to_onnx(learning.spec, best.genome, sim))
+        champion.export_onnx(path / ONNX)
         episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
         self.on_event(next(driving))  # the workers drive, and meanwhile:

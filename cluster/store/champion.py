@@ -21,6 +21,7 @@ from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
+from evolution.networks.export import to_onnx
 from evolution.networks.policy import CnnSpec, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
@@ -84,6 +85,13 @@ class Champion:
         """Write champion.npz. Raises CheckpointError if it cannot be written."""
         meta = {name: getattr(self, name) for name in ("policy", "scenario", "traffic")}
         checkpoint.save(path, {"genome": self.genome}, meta | {"sim": dataclasses.asdict(self.sim)})
+
+    def export_onnx(self, path: str | os.PathLike[str]) -> None:
+        """Write an ONNX file from the environment's observations to actions (docs/deploy.md).
+
+        Raises: GridSimError if the package onnx is not installed, CheckpointError if the file cannot be written.
+        """
+        checkpoint.write_atomic(path, to_onnx(PolicySpec.parse(self.policy), self.genome, self.sim))
 
 
 class UnfinishedError(CheckpointError):

@@ -18,7 +18,7 @@ class Model:
     note: str  # what this version is, Markdown
     tags: Mapping[str, str]  # the version's, CHAMPION_TAG among them, and the saved model's metadata
     onnx: Path
-    example: np.ndarray  # observations float32 [n, inputs]
+    example: Mapping[str, np.ndarray]  # observations [n, ...] by the names of the graph's inputs
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,8 @@ def headline(settings: RunSettings) -> str:
 
 def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> str:
     """A finished run's results and how to watch, load and repeat it, Markdown."""
-    held_out, inputs = summary["held_out"], PolicySpec.parse(settings.policy).inputs
+    held_out, spec = summary["held_out"], PolicySpec.parse(settings.policy)
+    takes = "observations" if spec.observation == "rays" else '{"grid": grids, "speed": speeds}'
     found = "Solved" if summary["solved"] else "The best so far"
     step = f"{settings.step_name}s"
     return "\n\n".join([
@@ -128,9 +129,9 @@ def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> s
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
         "Watch it: `drive.html` among the artifacts, or",
         f"    gridsim-watch {shlex.quote(str(folder))}",
-        f"Load it, an ONNX model of the environment's observations, float32 [n, {inputs}], which is registered as "
+        f"Load it, an ONNX model from the environment's observations [n, ...] to actions [n], which is registered as "
         f"`{model_name(settings)}`:",
-        '    mlflow.pyfunc.load_model("runs:/{run_id}/model").predict(observations)["outputs"]',
+        f'    mlflow.pyfunc.load_model("runs:/{{run_id}}/model").predict({takes})["action"]',
         f"Repeat the run: `{settings.command} --config config.json`.",
     ])  # fmt: skip
 
@@ -143,7 +144,7 @@ def onnx_model(folder: Path, settings: RunSettings, held_out: Mapping[str, float
     return Model(
         model_name(settings),
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
-        "observations and return a number for each of the eight actions; the action with the greatest is taken.",
+        "observations and return the action, and a number for each of the eight, of which that has the greatest.",
         note=f"{headline(settings)} {held_out['held_out/success_rate']:.1%} of the held-out drives succeed.",
         tags={
             CHAMPION_TAG: champion.sha256,

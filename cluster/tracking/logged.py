@@ -286,13 +286,15 @@ def _write_model(folder: Path, model: Model) -> None:
     from mlflow.onnx import save_model
     from mlflow.types.schema import Schema, TensorSpec
 
-    float32 = np.dtype(np.float32)
-    observations = TensorSpec(float32, (-1, model.example.shape[1]), "observation")
+    inputs = Schema([TensorSpec(array.dtype, (-1, *array.shape[1:]), name) for name, array in model.example.items()])
+    outputs = Schema([
+        TensorSpec(np.dtype(np.float32), (-1, 8), "outputs"), TensorSpec(np.dtype(np.int64), (-1,), "action"),
+    ])  # fmt: skip
     save_model(
         onnx.load(model.onnx),
         str(folder),
-        signature=ModelSignature(Schema([observations]), Schema([TensorSpec(float32, (-1, 8), "outputs")])),
-        input_example=model.example,
+        signature=ModelSignature(inputs, outputs),
+        input_example=dict(model.example),
         metadata=dict(model.tags),
         pip_requirements=[f"{name}=={version(name)}" for name in ("mlflow", "onnx", "onnxruntime")],
         onnx_execution_providers=["CPUExecutionProvider"],

@@ -1,12 +1,7 @@
-"""Policies outside GridSim: as an ONNX graph.
+"""Policies outside GridSim: as an ONNX graph from the environment's observations to its actions, n at a time.
 
-It takes the environment's observation, float32 [n, inputs]:
-
-* rays: the observation unchanged (`policy.act_on`);
-* grid: the cells of all frames, 0 to 255, the newest frame last, each row by row; then the speed in m/s.
-
-It returns the outputs, float32 [n, 8]; the action is the largest one, the first of ties. They equal the kernels'
-outputs up to float32 rounding.
+Inputs: `observation`, float32 [n, inputs]; on the grid `grid`, uint8 [n, frames, 80, 80], and `speed`, float32 [n, 1].
+Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the largest one.
 """
 
 from __future__ import annotations
@@ -30,6 +25,7 @@ from evolution.networks.policy import (
     PolicySpec,
 )
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 from gridsim.sensing.grid import CELLS, FREE
 
 OPSET, IR_VERSION = 17, 8
@@ -46,34 +42,46 @@ def layers_of(spec: PolicySpec, genome: Any) -> list[tuple[Any, Any]]:
 
 
 def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
-    """A genome float32 [genes] as an ONNX file: input `observation`, output `outputs`.
+    """A genome float32 [genes] as an ONNX file.
 
     The same genome always gives the same bytes. `config` gives the scales of the environment's observations.
-    Raises: ValueError with one line if the genome does not fit the policy.
+    Raises: GridSimError if onnx is not installed, ValueError if the genome does not fit the policy.
     """
-    from onnx import TensorProto, helper, numpy_helper  # takes 0.2 s
-
+    try:
+        from onnx import TensorProto, helper, numpy_helper  # takes 0.2 s
+    except ModuleNotFoundError as error:
+        raise GridSimError("an ONNX file needs the package onnx: pip install onnx") from error
     if genome.shape != (spec.size,) or genome.dtype != np.float32:
         raise ValueError(f"a genome of {spec} is float32 [{spec.size}], not {genome.dtype} {genome.shape}")
     graph = _Graph()
     if isinstance(spec, CnnSpec):
-        last = _add_cnn(graph, spec, genome)
+        last = _add_cnn(graph, spec, genome, config)
     else:
         assert isinstance(spec, MlpSpec)
         last = _add_mlp(graph, spec, genome, config)
-    graph.nodes.append(("Identity", (last,), ("outputs",), {}))
+    graph.nodes += [
+        ("Identity", (last,), ("outputs",), {}),
+        ("ArgMax", (last,), ("action",), {"axis": 1, "keepdims": 0}),
+    ]
+    types = {"uint8": TensorProto.UINT8, "float32": TensorProto.FLOAT}
     model = helper.make_model(
         helper.make_graph(
             [helper.make_node(kind, inputs, outputs, **more) for kind, inputs, outputs, more in graph.nodes],
             str(spec),
-            [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["n", spec.inputs])],
-            [helper.make_tensor_value_info("outputs", TensorProto.FLOAT, ["n", spec.outputs])],
+            [
+                helper.make_tensor_value_info(name, types[str(array.dtype)], ["n", *array.shape[1:]])
+                for name, array in example(spec, config).items()
+            ],
+            [
+                helper.make_tensor_value_info("outputs", TensorProto.FLOAT, ["n", spec.outputs]),
+                helper.make_tensor_value_info("action", TensorProto.INT64, ["n"]),
+            ],
             [numpy_helper.from_array(array, name) for name, array in graph.constants.items()],
         ),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="gridsim",
-        doc_string="Takes the environment's observations. The action is the index of the largest output.",
+        doc_string="Takes GridSim's observations. The action is the index of the largest output.",
     )
     return model.SerializeToString(deterministic=True)
 
@@ -104,13 +112,6 @@ class _Graph:
             value = self.add("Add", self.add("Mul", x, value), self.constant(coefficient))
         return value
 
-    def split(self, at: int, size: int) -> tuple[str, str]:
-        """The observation's first `at` columns and the others."""
-        self.nodes.append(
-            ("Split", ("observation", self.constant([at, size - at], np.int64)), ("first", "rest"), {"axis": 1})
-        )
-        return "first", "rest"
-
     def dense(self, x: str, weights: np.ndarray, biases: np.ndarray) -> str:
         """A dense layer, without its activation."""
         return self.add("Gemm", x, self.constant(weights), self.constant(biases))
@@ -126,7 +127,9 @@ class _Graph:
 
 def _add_mlp(graph: _Graph, spec: MlpSpec, genome: np.ndarray, config: SimConfig) -> str:
     """Add a perceptron to a graph. Returns: the name of its outputs."""
-    ranges, rest = graph.split(RAYS, spec.inputs)
+    ranges, rest = "ranges", "rest"
+    columns = graph.constant([RAYS, spec.inputs - RAYS], np.int64)
+    graph.nodes.append(("Split", ("observation", columns), (ranges, rest), {"axis": 1}))
     ranges = graph.add("Mul", ranges, graph.constant(config.sensors.range))
     near = graph.add("Div", ranges, graph.add("Add", ranges, graph.constant(RAY_HALF)))
     speed = config.vehicle.speed_limit / float(SPEED_SCALE)
@@ -141,13 +144,11 @@ def _add_mlp(graph: _Graph, spec: MlpSpec, genome: np.ndarray, config: SimConfig
     return graph.dense(x, *last)
 
 
-def _add_cnn(graph: _Graph, spec: CnnSpec, genome: np.ndarray) -> str:
+def _add_cnn(graph: _Graph, spec: CnnSpec, genome: np.ndarray, config: SimConfig) -> str:
     """Add a convolutional network to a graph. Returns: the name of its outputs."""
     one, two, _ = spec.hidden
     (w1, b1), (w2, b2), dense, last = layers_of(spec, genome)
-    cells, speed = graph.split(spec.inputs - 1, spec.inputs)
-    x = graph.add("Mul", cells, graph.constant(1.0 / 255.0))
-    x = graph.add("Reshape", x, graph.constant([-1, spec.frames, CELLS, CELLS], np.int64))
+    x = graph.add("Mul", graph.add("Cast", "grid", to=1), graph.constant(1.0 / 255.0))  # 1 is float32
     # A genome orders a unit's inputs (frame, row, column), then (row, column, channel).
     w1 = w1.reshape(spec.frames, KERNEL_1, KERNEL_1, one).transpose(3, 0, 1, 2)
     w2 = w2.reshape(KERNEL_2, KERNEL_2, one, two).transpose(3, 2, 0, 1)
@@ -155,18 +156,16 @@ def _add_cnn(graph: _Graph, spec: CnnSpec, genome: np.ndarray) -> str:
         x = graph.add("Conv", x, graph.constant(weights), graph.constant(biases), strides=[stride, stride])
         x = graph.add("Relu", x)
     x = graph.add("Flatten", graph.add("Transpose", x, perm=[0, 2, 3, 1]), axis=1)
-    x = graph.add("Concat", x, graph.horner(speed, 1.0 / float(SPEED_SCALE), -1.0), axis=1)
+    x = graph.add("Concat", x, graph.horner("speed", config.vehicle.speed_limit / float(SPEED_SCALE), -1.0), axis=1)
     return graph.dense(graph.add("Relu", graph.dense(x, *dense)), *last)
 
 
-def example(spec: PolicySpec, config: SimConfig) -> np.ndarray:
-    """Example observations, float32 [2, inputs]: nothing in sight, at standstill and at 10 m/s."""
-    speeds = np.array([0.0, 10.0], dtype=np.float32)
-    observations = np.zeros((2, spec.inputs), dtype=np.float32)  # wheels straight ahead
+def example(spec: PolicySpec, config: SimConfig) -> dict[str, np.ndarray]:
+    """Two example observations, by the names of the graph's inputs: nothing in sight, at standstill and at 10 m/s."""
+    shares = np.array([0.0, 10.0 / config.vehicle.speed_limit], dtype=np.float32)
     if isinstance(spec, CnnSpec):
-        observations[:, :-1], observations[:, -1] = FREE, speeds
-        return observations
+        return {"grid": np.full((2, spec.frames, CELLS, CELLS), FREE, dtype=np.uint8), "speed": shares[:, None]}
     assert isinstance(spec, MlpSpec)
-    observations[:, :RAYS] = 1.0
-    observations[:, 2 * RAYS if spec.motion else RAYS] = speeds / config.vehicle.speed_limit
-    return observations
+    observations = np.zeros((2, spec.inputs), dtype=np.float32)  # wheels straight ahead
+    observations[:, :RAYS], observations[:, 2 * RAYS if spec.motion else RAYS] = 1.0, shares
+    return {"observation": observations}

@@ -33,13 +33,13 @@ def test_mlflow_loads_the_champion(uri, tmp_path, policy, monkeypatch):
     champion, shown = load_champion(folder), example(spec, SimConfig())
     for address in (f"models:/{MODEL}@best", f"runs:/{run_id}/model"):
         loaded = mlflow.pyfunc.load_model(address)
-        outputs = loaded.predict(shown)["outputs"]
-        assert outputs.shape == (2, 8)
-        if spec.observation == "rays":
-            assert (outputs.argmax(axis=1) == champion.act(shown)).all()
+        found = loaded.predict(shown)
+        assert found["outputs"].shape == (2, 8)
+        assert (found["action"] == champion.act(shown.get("observation", shown))).all()
     about = loaded.metadata
-    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, spec.inputs)}
-    assert about.signature.outputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, 8)}
+    kinds = {each["name"]: each["tensor-spec"] for each in about.signature.inputs.to_dict()}
+    assert kinds == {name: {"dtype": str(x.dtype), "shape": (-1, *x.shape[1:])} for name, x in shown.items()}
+    assert [each.name for each in about.signature.outputs] == ["outputs", "action"]
     assert about.metadata["champion_sha256"] == champion.sha256
     stored = tmp_path / "store/mlartifacts" / run_id / "artifacts/model"
     needed = [line.partition("==")[0] for line in (stored / "requirements.txt").read_text().splitlines()]

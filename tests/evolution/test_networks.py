@@ -10,10 +10,13 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from gymnasium.spaces import Dict
+from gymnasium.vector.utils import batch_space
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from searching import new_genomes
 
+from cluster.store.champion import Champion
 from evolution.dqn.learner import QNetwork
 from evolution.networks import convnet, policy
 from evolution.networks.export import to_onnx
@@ -21,7 +24,8 @@ from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
-from gridsim.sensing.grid import grid_table, grids
+from gridsim.errors import GridSimError
+from gridsim.sensing.grid import CELLS, grid_table, grids
 
 F = np.float32
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
@@ -252,9 +256,9 @@ OTHER = SimConfig(VehicleConfig(speed_limit=20.0, steering_limit=20.0), SensorCo
 CONFIGS = pytest.mark.parametrize("config", [SimConfig(), OTHER], ids=["usual", "other"])
 
 
-def run(file, observations):
+def run(file, **observations):
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-    return session.run(["outputs"], {"observation": observations})[0]
+    return session.run(["outputs"], observations)[0]
 
 
 def rays(spec):
@@ -279,13 +283,10 @@ def test_perceptrons_give_the_kernels_outputs(text, config):
         observations[:, at] * speed, observations[:, -1] * angle,
     )  # fmt: skip
     close = {"rtol": 0.0, "atol": 5e-6 * np.abs(expected).max()}
-    found = run(to_onnx(spec, genome, config), observations)
+    found = run(to_onnx(spec, genome, config), observation=observations)
     assert (found.shape, found.dtype) == ((300, 8), F)
     np.testing.assert_allclose(found, expected, **close)
-    np.testing.assert_allclose(run(to_onnx(spec, genome, config), observations[:1]), expected[:1], **close)
-    actions = np.asarray(act_on(spec, genome, observations, config))
-    assert len(set(actions.tolist())) > 1
-    assert (expected.argmax(axis=1) == actions).all()
+    np.testing.assert_allclose(run(to_onnx(spec, genome, config), observation=observations[:1]), expected[:1], **close)
 
 
 @CONFIGS
@@ -294,11 +295,42 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
     spec, rng = PolicySpec.parse(text), np.random.default_rng(6)
     assert isinstance(spec, CnnSpec)
     genome = (0.1 * rng.standard_normal(spec.size)).astype(F)
-    cells, speeds = rng.choice([0, 127, 255], (5, spec.inputs - 1)).astype(F), rng.uniform(0.0, 20.0, 5).astype(F)
-    found = run(to_onnx(spec, genome, config), np.column_stack([cells, speeds]))
+    frames = rng.choice([0, 127, 255], (5, spec.frames, CELLS, CELLS)).astype(np.uint8)
+    shares = rng.uniform(0.0, 1.0, (5, 1)).astype(F)
+    found = run(to_onnx(spec, genome, config), grid=frames, speed=shares)
     for n in range(5):
-        expected = convolved(spec, genome, cells[n].astype(np.uint8).reshape(spec.frames, -1), speeds[n])
+        speed = shares[n, 0] * F(config.vehicle.speed_limit)
+        expected = convolved(spec, genome, frames[n].reshape(spec.frames, -1), speed)
         np.testing.assert_allclose(found[n], expected, rtol=0.0, atol=1e-5 * np.abs(expected).max())
+
+
+@CONFIGS
+@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering", "cnn:8,8,24@2"])
+def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, config, tmp_path):
+    genome = np.random.default_rng(7).normal(0.0, 0.2, PolicySpec.parse(text).size).astype(F)
+    champion = Champion(genome, text, "curved", config)
+    champion.export_onnx(tmp_path / "champion.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "champion.onnx", providers=["CPUExecutionProvider"])
+    batch = batch_space(champion.make_env(maps=1).observation_space, 1000)
+    batch.seed(8)
+    spaces = dict(batch) if isinstance(batch, Dict) else {"observation": batch}
+    asked = {one.name: (one.type, one.shape) for one in session.get_inputs()}
+    kinds = {"float32": "tensor(float)", "uint8": "tensor(uint8)"}
+    assert asked == {name: (kinds[str(box.dtype)], ["n", *(box.shape or ())[1:]]) for name, box in spaces.items()}
+    actions = []
+    for _ in range(10):
+        seen = batch.sample()
+        actions += session.run(["action"], seen if isinstance(seen, dict) else {"observation": seen})[0].tolist()
+        assert actions[-1000:] == np.asarray(champion.act(seen)).tolist()
+    assert len(set(actions)) > 1
+
+
+def test_without_onnx_a_line_says_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    spec = PolicySpec.parse("mlp:3")
+    with pytest.raises(GridSimError, match=r"^[^\n]*pip install onnx$"):
+        Champion(new_genomes(spec)[0], str(spec), "curved", SimConfig()).export_onnx(tmp_path / "champion.onnx")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("text", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
