@@ -88,7 +88,7 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
             browser.wait_for(f"{curves} == 1")
         page = f"http://127.0.0.1:{port}/#/models/{MODEL}/versions/1?workflowType=machine_learning"
         with Browser(page, tmp_path / "another profile") as browser:
-            for words in ("champion_sha256", "Inputs (1)", "Outputs (1)", "50.0% of the held-out drives"):
+            for words in ("champion_sha256", "Inputs (1)", "Outputs (2)", "50.0% of the held-out drives"):
                 browser.wait_for_text(words)
         address = f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry"
         events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": "application/json"})

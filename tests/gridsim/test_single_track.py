@@ -16,6 +16,7 @@ from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
 from gridsim.state import SLIP, SPEED, YAW_RATE
+from gridsim.step import parameters
 
 THEIRS = parameters_vehicle2()
 SEDAN = VehicleConfig(
