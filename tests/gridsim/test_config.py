@@ -16,6 +16,7 @@ from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, SPEED, STEPS, End, X, Y
+from gridsim.view.render import Renderer
 
 DEFAULT = SimConfig()
 
@@ -144,24 +145,29 @@ def eighth(config: SimConfig) -> SimConfig:
 
 @pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")
 def test_a_car_of_an_eighth_on_a_map_of_an_eighth_drives_an_eighth_bit_for_bit(tmp_path):
-    """Its starts, ranges, sub-steps, visits and ends: an eighth is exact in binary."""
+    """Its starts, ranges, sub-steps, visits, ends and pictures: an eighth is exact in binary."""
     save(tmp_path / "map.png", picture())
-    runs = []
-    for name, config, scale in (("large", DEFAULT, 1), ("small", eighth(DEFAULT), 8)):
+    runs, patient = [], SimConfig(episode=EpisodeConfig(patience=100.0))
+    there_and_back = [0] * 30 + [3] * 15 + [7] * 45 + [0] * 60
+    for name, config, scale in (("large", patient, 1), ("small", eighth(patient), 8)):
         road_map = build(
             str(write_yaml(tmp_path, name=name, resolution=0.25 / scale, speed=[5 / scale, 12 / scale])), 0, config
         )
         simulator, rng, states = Simulator(100, config), np.random.default_rng(1), []
         simulator.reset(road_map, road_map.starts[rng.integers(len(road_map.starts), size=100)])
-        for _ in range(150):
-            simulator.step(rng.choice([0, 0, 0, 1, 2, 3, 4, 5, 6, 7], 100))
+        for action in there_and_back:
+            actions = rng.choice([0, 0, 0, 1, 2, 3, 4, 5, 6, 7], 100)
+            actions[:30] = action
+            simulator.step(actions)
             states.append(
                 (simulator.cars[:, [X, Y, SPEED, DISTANCE]] * scale, simulator.ranges * scale, simulator.ends.copy())
             )
-        runs.append((road_map.starts * [scale, scale, 1, 1, 1], *map(np.stack, zip(*states, strict=True))))
+        renderer, path = Renderer(road_map, (160, 120), config), simulator.cars[1:9, :2]
+        drawn = renderer.draw(simulator.cars[0], simulator.cars[1:2], simulator.ranges[0], path)
+        runs.append((drawn, road_map.starts * [scale, scale, 1, 1, 1], *map(np.stack, zip(*states, strict=True))))
     for large, small in zip(*runs, strict=True):
         np.testing.assert_array_equal(large, small)
-    assert {End.COLLISION, End.IDLE} <= set(runs[0][-1][-1].tolist())
+    assert {End.RUNNING, End.COLLISION} == set(runs[0][-1][-1, :30].tolist())
 
 
 def test_generated_roads_are_as_small_as_the_car_and_slower():
