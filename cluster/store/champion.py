@@ -104,13 +104,6 @@ class Champion:
         """
         checkpoint.write_atomic(path, to_onnx(PolicySpec.parse(self.policy), self.genome, self.sim))
 
-    def export_onnx(self, path: str | os.PathLike[str]) -> None:
-        """Write an ONNX file from the environment's observations to actions (docs/deploy.md).
-
-        Raises: GridSimError if the package onnx is not installed, CheckpointError if the file cannot be written.
-        """
-        checkpoint.write_atomic(path, to_onnx(PolicySpec.parse(self.policy), self.genome, self.sim))
-
 
 class UnfinishedError(CheckpointError):
     """A run that has no champion yet; the message is one line for the user."""

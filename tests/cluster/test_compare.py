@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -35,6 +36,10 @@ if [ -e "away-$name" ]; then echo "gridsim-evolve: warning: not logged to MLflow
 """
 
 
+def test_all_runs_of_a_comparison_drive_its_car():
+    assert {run.settings.sim for run in Plan(sim="truck").planned(Path())} == {"truck"}
+
+
 def test_wrong_use_is_told_in_one_line(here, monkeypatch, capsys):
     write_plan(here, PLAN)
     make_run(here / "a")
@@ -43,6 +48,8 @@ def test_wrong_use_is_told_in_one_line(here, monkeypatch, capsys):
         (["."], "none of its runs is finished"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
+        (["--sim", "truk"], "did you mean truck?"),
+        (["--resume", ".", "--sim", "truck"], "contradicts the comparison's default"),
         (["--jobs", 0], "--jobs must be 1 to 256, not 0"),
         (["--resume", "a"], "not a comparison's folder"),
         (["--resume", ".", "--seeds", 1], "contradicts the comparison's 2"),

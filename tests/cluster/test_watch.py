@@ -17,7 +17,7 @@ from commands import CHAMPION, call, refused
 from pictures import record_drive
 
 from cluster.commands import watch
-from cluster.commands.watch import watch_main
+from cluster.commands.watch import WatchFlags, _drives, watch_main
 from cluster.report.film import frames, picture, record, write_video
 from cluster.settings import EvolveSettings
 from cluster.store import checkpoint
@@ -26,6 +26,7 @@ from cluster.store.checkpoint import WriteError
 from cluster.store.folder import RunFolder
 from cluster.store.steps import Steps, read_elites
 from evolution.networks.policy import PolicySpec
+from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.state import End
@@ -87,6 +88,12 @@ def test_film_is_whole_or_not_there(drive, tmp_path, monkeypatch):
         write_video(path, iter([]), size, 1)
     assert path.read_bytes() == b"the one before"
     assert [f.name for f in tmp_path.iterdir()] == ["f.mp4"]
+
+
+def test_a_champion_is_watched_in_another_car():
+    drive, _ = next(_drives(WatchFlags(str(CHAMPION), output="a.gif", sim="f1tenth"), 2.0))
+    assert drive.sim == SimConfig.load("f1tenth")
+    assert (drive.period, float(drive.scenario.road.unit), drive.ranges.max() <= 7.5) == (0.05, 0.125, True)
 
 
 def test_watch_writes_films(here, monkeypatch, capsys):

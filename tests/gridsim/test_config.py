@@ -16,6 +16,7 @@ from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, SPEED, STEPS, End, X, Y
+from gridsim.view.render import Renderer
 
 DEFAULT = SimConfig()
 
@@ -115,19 +116,19 @@ def test_numbers_that_do_not_fit_each_other_are_refused(config, said):
 # --- Other control periods and sizes ---------------------------------------------------------------------------------
 
 
-def test_an_episode_lasts_as_long_with_any_control_period():
-    """Full throttle from rest: at 50 Hz, it began with less than 0.05 m a step, and ended after 0.3 s."""
-    seconds = {}
+@pytest.mark.parametrize("action", [Action.ACCELERATE, Action.NONE])
+def test_an_episode_lasts_as_long_with_any_control_period(action):
+    """From rest. At 50 Hz, full throttle began with less than 0.05 m a step, and the episode ended after 0.3 s."""
+    seconds = []
     for period in (0.1, 0.05, 0.02):
         simulator = Simulator(1, SimConfig(episode=EpisodeConfig(control_period=period)))
         straight = build("highway", 0, simulator.config)
         simulator.reset(straight, np.array([[*straight.network.points[0], 0.0, 0.0, 0.0]], dtype=np.float32))
         while not simulator.ends[0]:
-            simulator.step(np.array([Action.ACCELERATE]))
-        seconds[period] = simulator.cars[0, STEPS] * period
-    assert seconds[0.1] > 3.0
-    assert seconds[0.05] == pytest.approx(seconds[0.1], abs=0.2)
-    assert seconds[0.02] == pytest.approx(seconds[0.1], abs=0.2)
+            simulator.step(np.array([action]))
+        seconds.append(simulator.cars[0, STEPS] * period)
+    assert seconds == pytest.approx([seconds[0]] * 3, abs=0.2)
+    assert (seconds[0] == pytest.approx(1.5)) == (action == Action.NONE)
 
 
 def eighth(config: SimConfig) -> SimConfig:
@@ -145,24 +146,29 @@ def eighth(config: SimConfig) -> SimConfig:
 
 @pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")
 def test_a_car_of_an_eighth_on_a_map_of_an_eighth_drives_an_eighth_bit_for_bit(tmp_path):
-    """Its starts, ranges, sub-steps, visits and ends: an eighth is exact in binary."""
+    """Its starts, ranges, sub-steps, visits, ends and pictures: an eighth is exact in binary."""
     save(tmp_path / "map.png", picture())
-    runs = []
-    for name, config, scale in (("large", DEFAULT, 1), ("small", eighth(DEFAULT), 8)):
+    runs, patient = [], SimConfig(episode=EpisodeConfig(patience=100.0))
+    there_and_back = [0] * 30 + [3] * 15 + [7] * 45 + [0] * 60
+    for name, config, scale in (("large", patient, 1), ("small", eighth(patient), 8)):
         road_map = build(
             str(write_yaml(tmp_path, name=name, resolution=0.25 / scale, speed=[5 / scale, 12 / scale])), 0, config
         )
         simulator, rng, states = Simulator(100, config), np.random.default_rng(1), []
         simulator.reset(road_map, road_map.starts[rng.integers(len(road_map.starts), size=100)])
-        for _ in range(150):
-            simulator.step(rng.choice([0, 0, 0, 1, 2, 3, 4, 5, 6, 7], 100))
+        for action in there_and_back:
+            actions = rng.choice([0, 0, 0, 1, 2, 3, 4, 5, 6, 7], 100)
+            actions[:30] = action
+            simulator.step(actions)
             states.append(
                 (simulator.cars[:, [X, Y, SPEED, DISTANCE]] * scale, simulator.ranges * scale, simulator.ends.copy())
             )
-        runs.append((road_map.starts * [scale, scale, 1, 1, 1], *map(np.stack, zip(*states, strict=True))))
+        renderer, path = Renderer(road_map, (160, 120), config), simulator.cars[1:9, :2]
+        drawn = renderer.draw(simulator.cars[0], simulator.cars[1:2], simulator.ranges[0], path)
+        runs.append((drawn, road_map.starts * [scale, scale, 1, 1, 1], *map(np.stack, zip(*states, strict=True))))
     for large, small in zip(*runs, strict=True):
         np.testing.assert_array_equal(large, small)
-    assert {End.COLLISION, End.IDLE} <= set(runs[0][-1][-1].tolist())
+    assert {End.RUNNING, End.COLLISION} == set(runs[0][-1][-1, :30].tolist())
 
 
 def test_generated_roads_are_as_small_as_the_car_and_slower():

@@ -65,6 +65,18 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
     assert np.ptp(again[:, 0]) > 1.0
 
 
+def test_a_drive_is_replayed_in_its_own_car_and_one_of_former_versions_in_the_default(scenario, recorded, tmp_path):
+    small = build("curved", 3, SimConfig.load("f1tenth"))
+    start = sample_starts(small, 1, np.random.default_rng(0))[0]
+    poses = record_drive(tmp_path / "small.csv", small, start, [[0] * 8], sim="f1tenth")
+    drive = read_drive(tmp_path / "small.csv")
+    assert len(drive) == 8
+    assert replay(drive, small)[0].tobytes() == poses.tobytes()
+    rows = recorded[0].read_text().splitlines()
+    (tmp_path / "old.csv").write_text("\n".join(row.rpartition(",")[0] for row in rows))
+    assert replay(read_drive(tmp_path / "old.csv"), scenario)[0].tobytes() == recorded[1].tobytes()
+
+
 def test_a_drive_that_is_begun_anew_in_traffic_replays_among_the_same_cars(scenario, tmp_path):
     shown: list[np.ndarray] = []
     pressed = iter([*[set()] * 5, {"r"}, *[set()] * 5, {"q"}])

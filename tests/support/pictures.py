@@ -95,10 +95,10 @@ def cars_on(network, *rows):
     return world
 
 
-def record_drive(path, scenario, start, episodes):
+def record_drive(path, scenario, start, episodes, sim="default"):
     """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
-    simulator, states = manual(SimConfig()), []
-    with closing(Recorder(path, scenario)) as recorder:
+    simulator, states = manual(SimConfig.load(sim)), []
+    with closing(Recorder(path, scenario, sim=sim)) as recorder:
         for episode, actions in enumerate(episodes):
             simulator.reset(scenario, start[None])
             for step, action in enumerate(actions):
