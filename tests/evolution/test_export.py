@@ -1,6 +1,5 @@
 """Champions outside GridSim, in ONNX, against the kernels that drive them."""
 
-import math
 import subprocess
 import sys
 
@@ -41,12 +40,7 @@ def test_perceptrons_give_the_kernels_outputs(text, config):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, MlpSpec)
     genome, observations = rays(spec)
-    speed, angle = F(config.vehicle.speed_limit), F(math.radians(config.vehicle.steering_limit))
-    at = 2 * RAYS if spec.motion else RAYS
-    expected = outputs_of(
-        spec, genome, observations[:, :RAYS] * F(config.sensors.range), observations[:, RAYS:at] * speed,
-        observations[:, at] * speed, observations[:, -1] * angle,
-    )  # fmt: skip
+    expected = outputs_of(spec, genome, observations, config)
     close = {"rtol": 0.0, "atol": 5e-6 * np.abs(expected).max()}
     found = run(to_onnx(spec, genome, config), observations)
     assert (found.shape, found.dtype) == ((300, 8), F)

@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 
 from evolution.networks import policy
 from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, gene_scales, squash
+from gridsim.config import SimConfig, constants
+from gridsim.sensing.observation import encode
 
 F = np.float32
+K = constants(SimConfig())
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
 TEXTS = ["mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8", *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS))]
 
@@ -73,7 +76,9 @@ def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
 
 def test_what_the_network_sees():
     inputs, ranges = np.zeros(33, dtype=F), np.linspace(0, 50, 31)
-    policy.encode(ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    encode(K, ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    assert inputs == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
+    policy.normalise(K, 31, inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
     assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see

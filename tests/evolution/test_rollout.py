@@ -9,23 +9,24 @@ from cluster.store.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import RESULT, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, outputs_of
+from evolution.networks.policy import PolicySpec, act_on
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
 from gridsim.maps.scenarios import build
+from gridsim.sensing.observation import observations
 from gridsim.simulator import Simulator
 from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
+K = constants(CONFIG)
 CARS = 8
 TARGET, STEPS = 1000.0, 1700
 
 
 def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
-    ranges, speeds = simulator.ranges, simulator.cars[:, SPEED].copy()
-    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
+    return act_on(spec, genome, observations(K, simulator.ranges, None, simulator.cars, False), CONFIG)
 
 
 @pytest.fixture(scope="module")

@@ -40,11 +40,9 @@ def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, se
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
     genome = new_genomes(spec, seed=seed)[0]
 
-    def outputs(seen):
-        closing, speeds = 20.0 * seen[:, RAYS : 2 * RAYS], 20.0 * seen[:, 2 * RAYS if spec.motion else RAYS]
-        return outputs_of(spec, genome, 50.0 * seen[:, :RAYS], closing, speeds, 0.5 * seen[:, -1])
-
-    one, other = outputs(observations), outputs(in_a_mirror(spec, observations))
+    one, other = (
+        outputs_of(spec, genome, seen, SimConfig()) for seen in (observations, in_a_mirror(spec, observations))
+    )
     assert np.abs(one).max() > 0.1
     np.testing.assert_allclose(one[:, MIRRORED_ACTIONS], other, atol=1e-4)
 
