@@ -12,17 +12,20 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, store_rays
+from evolution.episodes import comfort
+from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
-from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
+from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
 from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import ZERO, F, I, U, freeze, leaf, njit
+from gridsim.jit import ZERO, F, I, U, exact, freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.imperfections import History, late_command, new_history
+from gridsim.sensing.observation import encode, speed_share
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
@@ -33,8 +36,14 @@ _IDLE = int(End.IDLE)
 #: before the end.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
-#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
-RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
+#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End. Then the
+#: figures of comfort if they are asked for, else 0: mean square (m2/s4) and largest (m/s2) lateral acceleration, mean
+#: square of the jerk (m2/s6, along and across), least gap to another car (m; inf without one), and for how long (s) a
+#: car straight ahead was less than a second away.
+RESULT = np.dtype(
+    [("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")]
+    + [(name, "<f4") for name in ("lateral", "lateral_peak", "jerk", "gap", "close")]
+)
 
 
 class GridBuffers(NamedTuple):
@@ -92,6 +101,14 @@ def _copy_world(world, kept):
             kept[j, i] = world[j, i]
 
 
+@leaf
+def _keep(workspace, car, world, step):
+    """Keep the states before a step in the workspace's rings."""
+    _copy(car, workspace.ring[step % workspace.ring.shape[0]])
+    if world is not None:
+        _copy_world(world, workspace.world_ring[step % workspace.world_ring.shape[0]])
+
+
 @njit
 def make_workspace(simulation, layers, rows, cars):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
@@ -126,8 +143,16 @@ def _observe(simulation, car, world, workspace, closing, grid_buffers):
     look(simulation, car, world, workspace.ranges, closing, workspace.history)
     if grid_buffers is None:
         encode(simulation.constants, workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
+        rays = workspace.ranges.shape[0]
+        normalise(simulation.constants, rays if closing is None else 2 * rays, workspace.scratch)
     else:
         fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
+
+
+@exact
+def _observed_speed(constants, car):
+    """The speed (m/s) that a network on the grid reads from its observation."""
+    return speed_share(constants, car[SPEED]) * constants.speed_limit
 
 
 @leaf
@@ -137,7 +162,7 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
     else:
-        store_grid(grid_buffers.grid, car[SPEED], observations[row])
+        store_grid(grid_buffers.grid, _observed_speed(simulation.constants, car), observations[row])
     actions[row], rewards[row], ends[row] = NO_ACTION, F(0.0), 0
     if row > 0:
         k, ranges = simulation.constants, workspace.ranges
@@ -147,12 +172,12 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
 
 
 @leaf
-def _choose_action(packed, layers, car, workspace, grid_buffers, begun):
+def _choose_action(simulation, packed, layers, car, workspace, grid_buffers, begun):
     """Index of the action for the observation, which is overwritten; -1 if an output is NaN."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
-    return convnet.decide(packed, layers, car[SPEED], grid_buffers.scratch)
+    return convnet.decide(packed, layers, _observed_speed(simulation.constants, car), grid_buffers.scratch)
 
 
 @leaf
@@ -176,8 +201,10 @@ def _drive(simulation, setup, car, workspace, world, action):
 
 
 @njit(nogil=True)
-def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, result):
+def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, notes, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
+
+    Notes, float32 [comfort.NOTES], are for the figures of comfort; without them, None, these are left as they are.
 
     What may be None is an argument of its own: Numba prunes `is None` branches on arguments only, not on fields. If an
     output is NaN, the episode ends as IDLE; so does the last recorded step, if any.
@@ -185,10 +212,10 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
     end, steps, before = 0, 0, F(0.0)
-    if keep > 0:  # an episode may end without a step
-        _copy(car, workspace.ring[0])
-        if world is not None:
-            _copy_world(world, workspace.world_ring[0])
+    if notes is not None:
+        comfort.begin(car, notes)
+    if keep > 0:
+        _keep(workspace, car, world, 0)  # of an episode without a step, whose first output is NaN
     while True:
         if recorder is None and end != 0:
             break
@@ -198,7 +225,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             _record(simulation, car, workspace, grid_buffers, recorder.experience, steps, gained, end)
             if end != 0:
                 break
-        action = _choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
+        action = _choose_action(simulation, packed, layers, car, workspace, grid_buffers, steps == 0)
         if action < 0:
             end = _IDLE
             if recorder is not None and steps > 0:
@@ -208,19 +235,21 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             action = _explore(recorder, steps, action, layers[layers.shape[0] - 1])
             recorder.experience.actions[steps] = action
         if keep > 0:
-            _copy(car, workspace.ring[steps % keep])
-            if world is not None:
-                _copy_world(world, workspace.world_ring[steps % keep])
+            _keep(workspace, car, world, steps)
         before = car[DISTANCE]
         end = _drive(simulation, setup, car, workspace, world, action)
+        if notes is not None:
+            comfort.note(simulation.constants, simulation.road, car, world, steps, notes)
         steps += 1
     result["distance"], result["paced"] = car[DISTANCE], car[PACED]
     result["steps"], result["end"] = steps, end
+    if notes is not None:
+        comfort.finish(simulation.constants, steps, notes, result)
 
 
 @njit(nogil=True)
 def _rollout(
-    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, results, rewound, rewound_worlds
+    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, notes, results, rewound, rewound_worlds
 ):
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
@@ -230,7 +259,7 @@ def _rollout(
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
-        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, results[i])
+        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, notes, results[i])
         if rewind > 0:
             row_back = max(int(results[i]["steps"]) - rewind, 0) % rewind
             start_from(workspace.ring[row_back], rewound[i])
@@ -254,7 +283,9 @@ def _collect(
         setup = EpisodeSetup(starts[k], targets[k], steps[k])
         world = None if worlds is None else worlds[k].copy()
         recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
-        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, results[k])
+        run_episode(
+            simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, None, results[k]
+        )
 
 
 def _check_steps(episodes: np.ndarray) -> None:
@@ -270,11 +301,12 @@ def evaluate(
     episodes: np.ndarray,
     config: SimConfig,
     worlds: np.ndarray,
+    with_comfort: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
 
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
-    with, float32 [e, cars, TRAFFIC_FIELDS].
+    with, float32 [e, cars, TRAFFIC_FIELDS]; whether results have the figures of comfort.
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
     start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
@@ -290,7 +322,7 @@ def evaluate(
     k = int(kept[-1]) + 1 if len(kept) else 0
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
-    simulations = simulations_on(road_maps, config)
+    simulations, notes = simulations_on(road_maps, config), np.empty(NOTES, np.float32) if with_comfort else None
     for column, episode in enumerate(episodes):
         simulation = simulations[episode["map"]]
         if config.randomise:
@@ -300,7 +332,7 @@ def evaluate(
         row = kept[column]
         _rollout(
             simulation, genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
-            results[column], rewound[row], rewound_worlds[row],
+            notes, results[column], rewound[row], rewound_worlds[row],
         )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
 
@@ -368,7 +400,7 @@ def trajectory(
     packed = packed_genome(freeze(genome), spec.layers, grid_buffers)
     setup, recorder = EpisodeSetup(freeze(start), F(target), steps), None
     run_episode(
-        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, result[0]
+        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, None, result[0]
     )  # fmt: skip
     last = int(result[0]["steps"])
     workspace.ring[last] = workspace.car
