@@ -59,18 +59,15 @@ def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
     else:
         assert isinstance(spec, MlpSpec)
         last = _add_mlp(graph, spec, genome, config)
-    graph.nodes += [
-        ("Identity", (last,), ("outputs",), {}),
-        ("ArgMax", (last,), ("action",), {"axis": 1, "keepdims": 0}),
-    ]
-    types = {"uint8": TensorProto.UINT8, "float32": TensorProto.FLOAT}
+    graph.nodes.append(("Identity", (last,), ("outputs",), {}))
+    graph.nodes.append(("ArgMax", (last,), ("action",), {"axis": 1, "keepdims": 0}))
     model = helper.make_model(
         helper.make_graph(
             [helper.make_node(kind, inputs, outputs, **more) for kind, inputs, outputs, more in graph.nodes],
             str(spec),
             [
-                helper.make_tensor_value_info(name, types[str(array.dtype)], ["n", *array.shape[1:]])
-                for name, array in example(spec, config).items()
+                helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(x.dtype), ["n", *x.shape[1:]])
+                for name, x in example(spec, config).items()
             ],
             [
                 helper.make_tensor_value_info("outputs", TensorProto.FLOAT, ["n", spec.outputs]),

@@ -35,9 +35,9 @@ class Space:
             raise GridSimError(f"a space of {self.size} genes needs as many scales above 0, float32 [{self.size}]")
         object.__setattr__(self, "scales", scales)
         free, bound, source, factor = self.symmetry
-        genes = np.arange(self.size)
-        fits = np.array_equal(np.sort(np.concatenate([free, bound])), genes) and np.isin(source, genes).all()
-        if not fits or not len(bound) == len(source) == len(factor):
+        every = np.sort(np.concatenate([free, bound]))
+        fits = np.array_equal(every, np.arange(self.size)) and len(bound) == len(source) == len(factor)
+        if not fits or not np.isin(source, every).all():
             raise GridSimError(f"the mirror does not fit a space of {self.size} genes")
 
     @cached_property
