@@ -233,16 +233,28 @@ def change_lanes(network, drivers, world, i, ego):
 
 
 @leaf
-def _way_between(network, lane, along, other):
-    """Distance (m) from a place on a lane to a car on it, or on the lane after or before it; else 1e9."""
-    there, place = I(other[s.LANE]), other[s.ALONG]
-    if there == lane:
-        return place - along
-    if network.successors[lane, 0] == there:
-        return lane_length(network, lane) - along + place
-    if network.successors[there, 0] == lane:
-        return place - along - lane_length(network, there)
+def _way_ahead(network, car, lane, along, there, place):
+    """Distance (m) forwards from `along` m on a lane to `place` m on another; 1e9 above LANE_CHANGE_SIGHT.
+
+    The way is the car's own as far as it is known, then along first successors.
+    """
+    begins = -along  # m ahead at which the lane begins
+    while lane >= 0 and begins <= config.LANE_CHANGE_SIGHT:
+        if lane == there and begins + place >= ZERO:
+            return begins + place
+        begins += lane_length(network, lane)
+        onward = lane_after(car, lane)
+        lane = onward if onward >= 0 else I(network.successors[lane, 0])
     return F(1e9)
+
+
+@leaf
+def _way_between(network, car, lane, along, other):
+    """Distance (m) from a car's place on a lane to another car, negative if that is behind; else 1e9."""
+    there, place = I(other[s.LANE]), other[s.ALONG]
+    ahead = _way_ahead(network, car, lane, along, there, place)
+    behind = _way_ahead(network, other, there, place, lane, along)
+    return ahead if ahead <= behind else -behind
 
 
 @leaf
@@ -284,8 +296,8 @@ def _choose_neighbour(network, drivers, world, i, ego):
             if dx * dx + dy * dy > config.LANE_CHANGE_SIGHT * config.LANE_CHANGE_SIGHT:
                 continue
             if j < world.shape[0]:
-                ahead = _way_between(network, target, along, other)
-                behind = -_way_between(network, lane, car[s.ALONG], other)
+                ahead = _way_between(network, car, target, along, other)
+                behind = -_way_between(network, car, lane, car[s.ALONG], other)
                 changes = ahead > F(1e8) and behind < F(-1e8) and other[s.SHIFT] != ZERO
                 if changes and dx * dx + dy * dy < config.LANE_CHANGE_ALONE * config.LANE_CHANGE_ALONE:
                     free = False  # another car is changing lanes, to or from the target lane

@@ -246,6 +246,22 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
     assert not (~hit & ~on_road(0.4)).any()
 
 
+def test_no_corner_of_a_parked_car_is_overlooked():
+    city = build("city", 3)
+    rng, parked, sides = np.random.default_rng(0), city.strips.blocks, city.size
+    away, angle = rng.uniform(1.0, 3.6, (6000, 1)), rng.uniform(-math.pi, math.pi, 6000)
+    points = parked[rng.integers(len(parked), size=6000), :2] + away * np.column_stack([np.cos(angle), np.sin(angle)])
+    poses = np.column_stack([points % sides, rng.uniform(-math.pi, math.pi, 6000)]).astype(F).astype(float)
+    hit = crashes(city.road, np.pad(poses.astype(F), ((0, 0), (0, 2))))
+
+    def on_road(margin):
+        return oracle.ExactRoad(city.strips, *sides).widened(margin).outline_on_road(poses, 2.0, 1.0)
+
+    assert 200 < (~hit).sum() < 1000
+    assert not (hit & on_road(-0.03)).any()
+    assert not (~hit & ~on_road(0.15)).any()  # the clearance's grid rounds corners off, by less than 0.2 m
+
+
 @pytest.fixture(scope="module")
 def plain():
     """Road everywhere: a torus of 128 m without an edge."""
