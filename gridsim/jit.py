@@ -128,6 +128,11 @@ def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(function, forceinline=True, _nrt=False)
 
 
+def exact(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A `leaf` without `fastmath`: it rounds the same in every kernel that inlines it, and as NumPy does."""
+    return njit(function, forceinline=True, _nrt=False, fastmath=False)
+
+
 def freeze(array: np.ndarray) -> np.ndarray:
     """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
     view = np.ascontiguousarray(array).view()

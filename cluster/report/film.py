@@ -18,9 +18,11 @@ from cluster.store.champion import Champion
 from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
+from gridsim.config import constants
 from gridsim.maps.map import Map
+from gridsim.sensing.observation import observations
 from gridsim.simulator import views
-from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End, X, Y
+from gridsim.state import DISTANCE, LANE, SPEED, End, X, Y
 
 if TYPE_CHECKING:
     from gridsim.view.render import Renderer
@@ -68,7 +70,8 @@ def record(
     ranges, closing = views(scenario, cars, worlds, champion.sim)
     outputs = None
     if isinstance(spec, MlpSpec):
-        outputs = outputs_of(spec, champion.genome, ranges, closing, cars[:, SPEED], cars[:, STEERING])
+        seen = observations(constants(champion.sim), ranges, closing if spec.motion else None, cars, spec.steering)
+        outputs = outputs_of(spec, champion.genome, seen, champion.sim)
     return Recording(scenario, cars, ranges, other_cars(worlds), end, episode.control_period, outputs)
 
 

@@ -13,15 +13,16 @@ import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, store_rays
 from evolution.networks import convnet
-from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
+from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import F, U, freeze, leaf, njit
+from gridsim.jit import F, U, exact, freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
+from gridsim.sensing.observation import encode, speed_share
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
@@ -124,9 +125,17 @@ def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
     look(simulation, car, world, workspace.ranges, closing)
     if grid_buffers is None:
-        encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
+        encode(simulation.constants, workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
+        rays = workspace.ranges.shape[0]
+        normalise(simulation.constants, rays if closing is None else 2 * rays, workspace.scratch)
     else:
         fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
+
+
+@exact
+def _observed_speed(constants, car):
+    """The speed (m/s) that a network on the grid reads from its observation."""
+    return speed_share(constants, car[SPEED]) * constants.speed_limit
 
 
 @leaf
@@ -136,7 +145,7 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
     else:
-        store_grid(grid_buffers.grid, car[SPEED], observations[row])
+        store_grid(grid_buffers.grid, _observed_speed(simulation.constants, car), observations[row])
     actions[row], rewards[row], ends[row] = NO_ACTION, F(0.0), 0
     if row > 0:
         k, ranges = simulation.constants, workspace.ranges
@@ -146,12 +155,12 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
 
 
 @leaf
-def _choose_action(packed, layers, car, workspace, grid_buffers, begun):
+def _choose_action(simulation, packed, layers, car, workspace, grid_buffers, begun):
     """Index of the action for the observation, which is overwritten; -1 if an output is NaN."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
-    return convnet.decide(packed, layers, car[SPEED], grid_buffers.scratch)
+    return convnet.decide(packed, layers, _observed_speed(simulation.constants, car), grid_buffers.scratch)
 
 
 @leaf
@@ -192,7 +201,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             _record(simulation, car, workspace, grid_buffers, recorder.experience, steps, gained, end)
             if end != 0:
                 break
-        action = _choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
+        action = _choose_action(simulation, packed, layers, car, workspace, grid_buffers, steps == 0)
         if action < 0:
             end = _IDLE
             if recorder is not None and steps > 0:

@@ -7,7 +7,6 @@ outputs], then the biases [outputs]. The forward pass of `cnn` policies is in `c
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -17,9 +16,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from evolution.networks.dense import tile
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
-from gridsim.jit import F, U, freeze, leaf, njit
+from gridsim.jit import F, U, exact, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
 RAYS = 31
@@ -186,23 +185,21 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
     return freeze(np.concatenate(parts).astype(np.float32))
 
 
-@leaf
-def encode(ranges, closing, speed, steering, inputs):
-    """Write the network's inputs: float32 [rays + 2], or [2 * rays + 2] if closing is not None.
+@exact
+def normalise(constants, speed_at, observation):
+    """Turn an observation (`gridsim.sensing.observation`) into the network's inputs, in place.
 
-    Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed and the steering
-    angle (rad) follow; a network without `+steering` has one input fewer and does not read the angle.
+    Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed, which is number
+    `speed_at`, and the steering angle follow; a network without `+steering` does not read the angle.
     """
-    rays = ranges.shape[0]
-    for i in range(rays):
-        inputs[i] = F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - F(1.0)
-    last = rays
-    if closing is not None:
-        for i in range(rays):
-            inputs[rays + i] = closing[i] / SPEED_SCALE
-        last = 2 * rays
-    inputs[last] = speed / SPEED_SCALE - F(1.0)
-    inputs[last + 1] = steering / STEERING_SCALE
+    for i in range(RAYS):
+        reach = observation[i] * constants.ray_range
+        observation[i] = F(2.0) * reach / (reach + RAY_HALF) - F(1.0)
+    scale = constants.speed_limit / SPEED_SCALE
+    for i in range(RAYS, speed_at):
+        observation[i] = observation[i] * scale
+    observation[speed_at] = observation[speed_at] * scale - F(1.0)
+    observation[speed_at + 1] = observation[speed_at + 1] * (constants.steering_limit / STEERING_SCALE)
 
 
 @leaf
@@ -316,25 +313,21 @@ def decide(packed, layers, scratch):
 
 
 @njit
-def _outputs(packed, layers, ranges, closing, speeds, angles, outputs):
+def _outputs(packed, layers, constants, speed_at, observations, outputs):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
-    for n in range(ranges.shape[0]):
-        encode(ranges[n], None if closing is None else closing[n], speeds[n], angles[n], scratch)
+    for n in range(observations.shape[0]):
+        for i in range(observations.shape[1]):
+            scratch[i] = observations[n, i]
+        normalise(constants, speed_at, scratch)
         first = forward(packed, layers, scratch)
         outputs[n] = scratch[first : first + outputs.shape[1]]
 
 
-def outputs_of(
-    spec: MlpSpec, genome: np.ndarray, ranges: np.ndarray, closing: np.ndarray, speeds: np.ndarray, angles: np.ndarray
-) -> np.ndarray:
-    """Outputs float32 [n, 8] of a perceptron, one for each action.
-
-    Args: ranges float32 [n, 31], m; closing speeds float32 [n, 31], m/s, of any shape without motion; speeds float32
-    [n], m/s; steering angles float32 [n], rad.
-    """
-    outputs = np.empty((len(ranges), spec.outputs), dtype=np.float32)
-    packed = pack(np.ascontiguousarray(genome), spec.layers)
-    _outputs(packed, spec.layers, ranges, closing if spec.motion else None, speeds, angles, outputs)
+def outputs_of(spec: MlpSpec, genome: np.ndarray, observations: np.ndarray, config: SimConfig) -> np.ndarray:
+    """Outputs float32 [n, 8] of a perceptron, one for each action, for observations float32 [n, inputs]."""
+    outputs = np.empty((len(observations), spec.outputs), dtype=np.float32)
+    packed, speed_at = pack(np.ascontiguousarray(genome), spec.layers), 2 * RAYS if spec.motion else RAYS
+    _outputs(packed, spec.layers, constants(config), speed_at, np.ascontiguousarray(observations), outputs)
     return outputs
 
 
@@ -346,10 +339,6 @@ def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    fastest = F(config.vehicle.speed_limit)
-    closing = many[:, RAYS : 2 * RAYS] * fastest
-    speeds = many[:, 2 * RAYS if spec.motion else RAYS] * fastest
-    angles = many[:, -1] * F(math.radians(config.vehicle.steering_limit))
-    outputs = outputs_of(spec, genome, many[:, :RAYS] * F(config.sensors.range), closing, speeds, angles)
+    outputs = outputs_of(spec, genome, many, config)
     actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
     return int(actions[0]) if np.ndim(observation) == 1 else actions

@@ -5,27 +5,13 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from gridsim.jit import F, njit
+from gridsim.config import constants
 from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.sensing.observation import observations, speed_share
 from gridsim.simulator import Simulator
-from gridsim.state import SPEED, STEERING
 
 _ALL = slice(None)
 Seen = np.ndarray | dict[str, np.ndarray]
-
-
-@njit
-def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
-    """Observations [n, rays + 1], with closing speeds [n, rays] in between if they are not None."""
-    rays = ranges.shape[1]
-    for i in range(ranges.shape[0]):
-        for r in range(rays):
-            observations[i, r] = min(ranges[i, r] / reach, F(1.0))
-        if closing is not None:
-            for r in range(rays):
-                observations[i, rays + r] = min(max(closing[i, r] / limit, F(-1.0)), F(1.0))
-        last = rays if closing is None else 2 * rays
-        observations[i, last] = min(max(speeds[i] / limit, slowest), F(1.0))
 
 
 def row(observations: Seen, i: int) -> Seen:
@@ -42,21 +28,20 @@ class Observer:
     def __init__(self, simulator: Simulator, observation: str, frames: int, motion: bool, steering: bool):
         self._simulator, self.config = simulator, simulator.config
         self._motion, self._steering = motion, steering
-        rays, vehicle = self.config.sensors.rays, self.config.vehicle
-        self._width = (2 if motion else 1) * rays + 1 + steering
-        self._slowest = F(-vehicle.reverse_limit / vehicle.speed_limit)
+        self._constants = constants(self.config)
+        rays, slowest = self.config.sensors.rays, speed_share(self._constants, -self._constants.reverse_limit)
         self._observation = observation
         shape = 0 if observation == "rays" else (len(simulator), frames, CELLS, CELLS)
         self._stack = np.zeros(shape, dtype=np.uint8)
         image = Box(0, 255, (frames, CELLS, CELLS), dtype=np.uint8)
-        low = np.zeros(self._width, dtype=np.float32)
+        low = np.zeros((2 if motion else 1) * rays + 1 + steering, dtype=np.float32)
         low[rays:] = -1.0
-        low[self._width - 1 - steering] = self._slowest
+        low[-1 - steering] = slowest
         self.space: Box | Dict = Box(low, np.ones_like(low))
         if observation == "image":
             self.space = image
         elif observation == "grid":
-            self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
+            self.space = Dict({"grid": image, "speed": Box(slowest, 1.0, (1,), dtype=np.float32)})
 
     def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Add the newest frames of cars `which` [k], as all frames of those that have `begun` [k]."""
@@ -72,27 +57,15 @@ class Observer:
 
     def look(self, which: np.ndarray | slice = _ALL) -> Seen:
         """Observations of cars `which`, after `take`; the caller owns them."""
-        speeds = np.ascontiguousarray(self._simulator.cars[which, SPEED])
+        simulator = self._simulator
+        ranges, closing = simulator.ranges[which], simulator.closing[which] if self._motion else None
+        rays = observations(self._constants, ranges, closing, simulator.cars[which], self._steering)
         if self._observation == "rays":
-            return self._rays(speeds, which)
+            return rays
         one = self._stack.shape[1] == 1
         image = self._grids(which)[:, None] if one else self._stack[which].copy()
-        if self._observation == "image":
-            return image
-        share = np.clip(speeds / F(self.config.vehicle.speed_limit), self._slowest, F(1.0))
-        return {"grid": image, "speed": share[:, None]}
+        return image if self._observation == "image" else {"grid": image, "speed": rays[:, -1:].copy()}
 
     def _grids(self, which: np.ndarray | slice) -> np.ndarray:
         # The table is not stored: copies of it would be writable, and kernels would be compiled again for them.
         return grids(grid_table(self.config), self._simulator.ranges[which])
-
-    def _rays(self, speeds: np.ndarray, which: np.ndarray | slice) -> np.ndarray:
-        vehicle, ranges = self.config.vehicle, self._simulator.ranges[which]
-        observations = np.empty((len(ranges), self._width), dtype=np.float32)
-        closing = self._simulator.closing[which] if self._motion else None
-        reach, limit = F(self.config.sensors.range), F(vehicle.speed_limit)
-        _observe(ranges, closing, speeds, reach, self._slowest, limit, observations)
-        if self._steering:
-            angles = self._simulator.cars[which, STEERING]
-            observations[:, -1] = np.clip(angles / np.radians(vehicle.steering_limit), -1.0, 1.0)
-        return observations

@@ -5,6 +5,7 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
+from pictures import cars_on
 from scipy import stats
 from searching import to_bytes
 
@@ -12,26 +13,28 @@ from cluster.store.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.curriculum import Curriculum, CurriculumConfig
-from evolution.episodes.rollout import RESULT, collect, evaluate, trajectory
+from evolution.episodes.rollout import EPISODE, RESULT, collect, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, encode, outputs_of
+from evolution.networks.policy import PolicySpec, act_on, normalise
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
+from gridsim.maps.map import starts_at
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
+from gridsim.sensing.observation import observations
 from gridsim.simulator import Simulator
 from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
+K = constants(CONFIG)
 CARS = 8
 TARGET, STEPS = 1000.0, 1700
 
 
 def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
-    ranges, speeds = simulator.ranges, simulator.cars[:, SPEED].copy()
-    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
+    return act_on(spec, genome, observations(K, simulator.ranges, None, simulator.cars, False), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -160,20 +163,27 @@ def cut_up(experience):
     return [Experience(*parts) for parts in zip(*(np.split(array, ends[:-1]) for array in experience), strict=True)]
 
 
+def inputs_of(simulator):
+    """What the environment shows of its one car, as a network with all inputs reads it."""
+    inputs = observations(K, simulator.ranges, simulator.closing, simulator.cars, True)[0]
+    normalise(K, 62, inputs)
+    return inputs
+
+
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
 def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, cars):
     of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
     inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
-    row, table, seen = 0, grid_table(CONFIG), np.zeros(64, dtype=F)
+    row, table = 0, grid_table(CONFIG)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
         simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars)
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
-        car, ranges, ends = simulator.cars[0], simulator.ranges, simulator.ends
+        ranges, ends = simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
-            encode(ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
+            seen = inputs_of(simulator)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
             assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
             row += 1
@@ -185,6 +195,22 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
             assert experience.ends[row - 1] == ends[0]
         assert ends[0] == result["end"]
     assert row == len(experience.actions) > 150
+
+
+def test_a_network_reads_the_closing_speeds_that_the_environment_shows():
+    """Also those above the 30 m/s at which an observation ends: of a car that comes at 25 m/s."""
+    road, spec = build("highway", 4), PolicySpec.parse("mlp:3+motion+steering")
+    world = cars_on(road.network, (1, 10.0, 25.0, 1.0))
+    episode = np.zeros(1, dtype=EPISODE)
+    episode["start"], episode["target"], episode["steps"] = starts_at(road, np.zeros(1)), TARGET, 1
+    episode["start"][0, :2] = world[0, [X, Y]] + 20.0 * world[0, [COS, SIN]]
+    episode["start"][0, 2:4] = math.atan2(world[0, SIN], world[0, COS]) + math.pi, 20.0
+    genome = np.ones(spec.size, F)
+    experience, _ = collect(spec, genome, [road], episode, np.zeros(1, F), np.zeros(1, np.uint64), CONFIG, world[None])
+    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1)
+    simulator.reset(road, episode["start"], worlds=world[None])
+    assert simulator.closing.max() == pytest.approx(45.0, abs=0.1)
+    np.testing.assert_allclose(experience.observations[0] / 4096, inputs_of(simulator), rtol=0.0, atol=0.6 / 4096)
 
 
 @pytest.mark.parametrize("cars", [0, CARS])
