@@ -43,13 +43,22 @@ TRAFFIC_FIELDS = 21
 
 
 class End(IntEnum):
-    """How an episode ended."""
+    """How an episode ended.
+
+    A collision and idling terminate: the value of what follows is 0. Success and time truncate: the road goes on, and
+    the observation shows neither the distance nor the time driven, so that the value of what follows is estimated from
+    the last observation (Pardo et al. 2018, "Time limits in reinforcement learning", section 4).
+    """
 
     RUNNING = 0
     COLLISION = 1  # off the road or into a car
     IDLE = 2  # too many steps without progress
     SUCCESS = 3  # the target distance is reached
-    TIME = 4  # the time limit (truncation)
+    TIME = 4  # the time limit
+
+
+TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])  # bool [ends]
+TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 
 def poses_of(states: np.ndarray) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, its
 action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.state.End` of the episode. Row T has the
-observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. COLLISION, IDLE and SUCCESS terminate: the
-value after them is 0. TIME truncates: the value after it is estimated from row T.
+observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. After an end that truncates, the value is
+estimated from row T.
 
 Observations are the network's inputs in a format small enough to keep a million of them:
 
-* rays: int16 [inputs], what `policy.encode` makes, in units of 1/4096 and clipped to [-8, 8);
+* rays: int16 [inputs], what `policy.normalise` makes, in units of 1/4096 and clipped to [-8, 8);
 * grid: uint8 [1602], one frame, and then the speed input as little-endian int16 in the same units. A cell takes two
   bits, 0, 1 and 2 for unknown, free and occupied: cell k is bits 2 (k mod 4) and the next of byte k // 4. The frames
   of a stack are those of the rows before; frames before the episode's first row are copies of that row's frame.

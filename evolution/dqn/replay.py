@@ -1,8 +1,8 @@
 """The replay buffer: a ring of the latest rows of experience, from which transitions are drawn uniformly.
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
-action and the row after it. The value after it counts unless the step ended in COLLISION, IDLE or SUCCESS: TIME only
-truncates an episode. Rows of grids that have lost earlier frames of their stack are no longer drawn.
+action and the row after it. The value after it counts unless the step terminated the episode (`gridsim.state.End`).
+Rows of grids that have lost earlier frames of their stack are no longer drawn.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from evolution.dqn.experience import NO_ACTION, Experience, ages, empty, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import U, njit
-from gridsim.state import End
+from gridsim.state import TERMINATES
 
 
 class Batch(NamedTuple):
@@ -89,13 +89,12 @@ class Replay:
         _draw(self._drawable, len(self), U(key), rows)
         after = (rows + 1) % self.capacity
         observations, actions, rewards, ends, age = self._rings.values()
-        goes_on = (ends[rows] == End.RUNNING) | (ends[rows] == End.TIME)
         return Batch(
             unpack(self.spec, observations, rows, age[rows]),
             actions[rows].astype(np.int64),
             rewards[rows],
             unpack(self.spec, observations, after, age[after]),
-            np.where(goes_on, self.discount, 0.0).astype(np.float32),
+            np.where(TERMINATES[ends[rows]], 0.0, self.discount).astype(np.float32),
         )
 
     def state(self) -> dict[str, np.ndarray]:

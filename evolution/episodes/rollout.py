@@ -93,6 +93,14 @@ def _copy_world(world, kept):
             kept[j, i] = world[j, i]
 
 
+@leaf
+def _keep(workspace, car, world, step):
+    """Keep the states before a step in the workspace's rings."""
+    _copy(car, workspace.ring[step % workspace.ring.shape[0]])
+    if world is not None:
+        _copy_world(world, workspace.world_ring[step % workspace.world_ring.shape[0]])
+
+
 @njit
 def make_workspace(simulation, layers, rows, cars):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
@@ -192,6 +200,8 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
     end, steps, before = 0, 0, F(0.0)
+    if keep > 0:
+        _keep(workspace, car, world, 0)  # of an episode without a step, whose first output is NaN
     while True:
         if recorder is None and end != 0:
             break
@@ -211,9 +221,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             action = _explore(recorder, steps, action, layers[layers.shape[0] - 1])
             recorder.experience.actions[steps] = action
         if keep > 0:
-            _copy(car, workspace.ring[steps % keep])
-            if world is not None:
-                _copy_world(world, workspace.world_ring[steps % keep])
+            _keep(workspace, car, world, steps)
         before = car[DISTANCE]
         end = _drive(simulation, setup, car, workspace.visits, world, action)
         steps += 1

@@ -43,7 +43,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.simulator import Simulator
-from gridsim.state import DISTANCE, LANE, SPEED, End
+from gridsim.state import DISTANCE, LANE, SPEED, TERMINATES, TRUNCATES, End
 from gridsim.view.display import has_display
 
 if TYPE_CHECKING:
@@ -52,9 +52,6 @@ if TYPE_CHECKING:
 RENDER_SIZE = (640, 480)  # pixels
 
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
-#: bool [ends]: which ends terminate, and which truncate, an episode.
-TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
-TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 
 class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
@@ -65,8 +62,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     as `final_info`. `DISABLED`: the caller resets cars that have ended, by `reset(options={"reset_mask": mask})`.
 
     info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of a
-    `state.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes
-    on and the observation shows neither.
+    `state.End`, arrays [n], which says what terminates and what truncates.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form

@@ -55,7 +55,7 @@ def test_frames_are_stacked_as_the_network_stacks_them(frames: int, turn: int) -
 # --- The replay ------------------------------------------------------------------------------------------------------
 
 RAYS, GRID, FRAME = (PolicySpec.parse(text) for text in ("mlp:3", "cnn:8,8,8@4", "cnn:8,8,8@1"))
-TERMINAL = (End.COLLISION, End.IDLE, End.SUCCESS)
+TERMINAL = (End.COLLISION, End.IDLE)  # as in the environment (test_env.py)
 
 
 def episode(rewards, end, first=0, spec=RAYS):
@@ -81,7 +81,7 @@ def numbers(observations, spec=RAYS):
 
 
 REWARDS = st.lists(st.integers(-9, 9), min_size=1, max_size=12)
-EPISODES = st.lists(st.tuples(REWARDS, st.sampled_from([*TERMINAL, End.TIME])), min_size=1, max_size=4)
+EPISODES = st.lists(st.tuples(REWARDS, st.sampled_from([*TERMINAL, End.SUCCESS, End.TIME])), min_size=1, max_size=4)
 
 
 def expected(parts, capacity, frames):
@@ -243,12 +243,12 @@ def test_a_chain_of_two_states_is_learned():
         while not ends or not ends[-1]:
             state = states[-1]
             actions.append(1 - state if rng.random() < 0.5 else int(rng.integers(8)))
-            success = state == 1 and actions[-1] == 0
+            done = state == 1 and actions[-1] == 0
             states.append(int(state == 0 and actions[-1] == 1))
-            ends.append(End.SUCCESS if success else End.TIME if len(ends) == 5 else End.RUNNING)
+            ends.append(End.IDLE if done else End.TIME if len(ends) == 5 else End.RUNNING)
         observations = np.zeros((len(states), 32), dtype=np.int16)
         observations[np.arange(len(states)), states] = 4096
-        rewards = np.append(np.array(ends) == End.SUCCESS, 0).astype(F)
+        rewards = np.append(np.array(ends) == End.IDLE, 0).astype(F)
         columns = (np.array([*actions, NO_ACTION], dtype=np.uint8), rewards, np.array([*ends, 0], dtype=np.uint8))
         replay.add(Experience(observations, *columns))
     rates = {"learning_rate": 0.01, "learning_rate_updates": 1_000, "final_learning_rate": 0.1}

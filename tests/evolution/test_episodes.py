@@ -117,6 +117,17 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         assert again.ends[0] == End.COLLISION
 
 
+def test_what_is_rewound_of_an_episode_without_a_step_is_its_start(among):
+    spec, genome, maps, episodes, worlds, _ = among
+    wanted = episodes[:1].copy()
+    wanted["rewind"], wanted["steps"] = 40, 60
+    both = np.stack([genome, np.full_like(genome, math.nan)])
+    results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds[:1])
+    assert results["steps"].tolist() == [[60], [0]]
+    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99], abs=1e-4)
+    assert then[1].tobytes() == worlds[:1].tobytes()
+
+
 def test_without_room_for_anybody_there_is_no_traffic(among):
     spec, genome, maps, episodes, _, _ = among
     absent = np.zeros((9, CARS, TRAFFIC_FIELDS), dtype=F)
