@@ -12,6 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, store_rays
+from evolution.episodes import comfort
+from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
 from gridsim.car.reward import reward
@@ -33,8 +35,14 @@ _IDLE = int(End.IDLE)
 #: before the end.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
-#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
-RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
+#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End. Then the
+#: figures of comfort if they are asked for, else 0: mean square (m2/s4) and largest (m/s2) lateral acceleration, mean
+#: square of the jerk (m2/s6, along and across), least gap to another car (m; inf without one), and for how long (s) a
+#: car straight ahead was less than a second away.
+RESULT = np.dtype(
+    [("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")]
+    + [(name, "<f4") for name in ("lateral", "lateral_peak", "jerk", "gap", "close")]
+)
 
 MAX_STEPS = 65_535
 
@@ -191,8 +199,10 @@ def _drive(simulation, setup, car, visits, world, action):
 
 
 @njit(nogil=True)
-def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, result):
+def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, notes, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
+
+    Notes, float32 [comfort.NOTES], are for the figures of comfort; without them, None, these are left as they are.
 
     What may be None is an argument of its own: Numba prunes `is None` branches on arguments only, not on fields. If an
     output is NaN, the episode ends as IDLE; so does the last recorded step, if any.
@@ -200,6 +210,8 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
     end, steps, before = 0, 0, F(0.0)
+    if notes is not None:
+        comfort.begin(car, notes)
     if keep > 0:
         _keep(workspace, car, world, 0)  # of an episode without a step, whose first output is NaN
     while True:
@@ -224,14 +236,18 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             _keep(workspace, car, world, steps)
         before = car[DISTANCE]
         end = _drive(simulation, setup, car, workspace.visits, world, action)
+        if notes is not None:
+            comfort.note(simulation.constants, simulation.road, car, world, steps, notes)
         steps += 1
     result["distance"], result["paced"] = car[DISTANCE], car[PACED]
     result["steps"], result["end"] = steps, end
+    if notes is not None:
+        comfort.finish(simulation.constants, steps, notes, result)
 
 
 @njit(nogil=True)
 def _rollout(
-    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, results, rewound, rewound_worlds
+    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, notes, results, rewound, rewound_worlds
 ):
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
@@ -241,7 +257,7 @@ def _rollout(
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
-        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, results[i])
+        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, notes, results[i])
         if rewind > 0:
             row_back = max(int(results[i]["steps"]) - rewind, 0) % rewind
             start_from(workspace.ring[row_back], rewound[i])
@@ -265,7 +281,9 @@ def _collect(
         setup = EpisodeSetup(starts[k], targets[k], steps[k])
         world = None if worlds is None else worlds[k].copy()
         recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
-        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, results[k])
+        run_episode(
+            simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, None, results[k]
+        )
 
 
 def _check_steps(episodes: np.ndarray) -> None:
@@ -281,11 +299,12 @@ def evaluate(
     episodes: np.ndarray,
     config: SimConfig,
     worlds: np.ndarray,
+    with_comfort: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
 
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
-    with, float32 [e, cars, TRAFFIC_FIELDS].
+    with, float32 [e, cars, TRAFFIC_FIELDS]; whether results have the figures of comfort.
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
     start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
@@ -301,14 +320,14 @@ def evaluate(
     k = int(kept[-1]) + 1 if len(kept) else 0
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
-    simulations = simulations_on(road_maps, config)
+    simulations, notes = simulations_on(road_maps, config), np.empty(NOTES, np.float32) if with_comfort else None
     for column, episode in enumerate(episodes):
         setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
         traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
         row = kept[column]
         _rollout(
             simulations[episode["map"]], genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
-            results[column], rewound[row], rewound_worlds[row],
+            notes, results[column], rewound[row], rewound_worlds[row],
         )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
 
@@ -372,7 +391,7 @@ def trajectory(
     packed = packed_genome(freeze(genome), spec.layers, grid_buffers)
     setup, recorder = EpisodeSetup(freeze(start), F(target), steps), None
     run_episode(
-        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, result[0]
+        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, None, result[0]
     )  # fmt: skip
     last = int(result[0]["steps"])
     workspace.ring[last] = workspace.car

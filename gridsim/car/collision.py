@@ -65,19 +65,24 @@ def collides(road, constants, x, y, cosine, sine):
 
 
 @leaf
-def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
-    """Whether two cars overlap, the other (dx, dy) m away: separating axes (Gottschalk et al. 1996)."""
+def separation(constants, dx, dy, cosine, sine, other_cosine, other_sine):
+    """Gap (m) between two cars along the best of their axes, the other (dx, dy) m away; negative if they overlap.
+
+    It is their distance unless their corners are closest; then it is less (Gottschalk et al. 1996).
+    """
     length, breadth = constants.half_length, constants.half_width
     along = abs(cosine * other_cosine + sine * other_sine)
     across = abs(cosine * other_sine - sine * other_cosine)
     long_side = length + length * along + breadth * across
     short_side = breadth + length * across + breadth * along
-    return (
-        abs(dx * cosine + dy * sine) <= long_side
-        and abs(dy * cosine - dx * sine) <= short_side
-        and abs(dx * other_cosine + dy * other_sine) <= long_side
-        and abs(dy * other_cosine - dx * other_sine) <= short_side
-    )
+    lengthwise = max(abs(dx * cosine + dy * sine), abs(dx * other_cosine + dy * other_sine)) - long_side
+    return max(lengthwise, max(abs(dy * cosine - dx * sine), abs(dy * other_cosine - dx * other_sine)) - short_side)
+
+
+@leaf
+def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
+    """Whether two cars overlap, the other (dx, dy) m away."""
+    return separation(constants, dx, dy, cosine, sine, other_cosine, other_sine) <= ZERO
 
 
 @leaf

@@ -5,6 +5,7 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
+from oracle import corners
 from pictures import cars_on
 from scipy import stats
 from searching import to_bytes
@@ -126,6 +127,45 @@ def test_what_is_rewound_of_an_episode_without_a_step_is_its_start(among):
     assert results["steps"].tolist() == [[60], [0]]
     assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99], abs=1e-4)
     assert then[1].tobytes() == worlds[:1].tobytes()
+
+
+def test_figures_of_comfort_are_those_of_the_states_driven(among):
+    spec, genome, maps, episodes, worlds, paths = among
+    plain, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds)
+    results, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds, with_comfort=True)
+    names = ["distance", "paced", "steps", "end"]
+    assert results[names].tolist() == plain[names].tolist()
+    dt, length, width = 0.1, 4.0, 2.0
+    for result, road, (_, states, traffic) in zip(results[0], episodes["map"], paths, strict=True):
+        cars, others = states.astype(float), traffic.astype(float)
+        heading, speed = np.unwrap(np.arctan2(cars[:, SIN], cars[:, COS])), cars[:, SPEED]
+        across, along = np.diff(heading) / dt * (speed[1:] + speed[:-1]) / 2, np.diff(speed) / dt
+        assert result["lateral"] == pytest.approx(np.mean(across**2), rel=1e-3)
+        assert result["lateral_peak"] == pytest.approx(np.abs(across).max(), rel=1e-3)
+        jerks = np.diff(across) ** 2 + np.diff(along) ** 2
+        assert result["jerk"] == pytest.approx(np.mean(jerks) / dt**2, rel=1e-3)
+        away, there = others[1:, :, [X, Y]] - cars[1:, None, [X, Y]], others[1:, :, LANE] >= 0
+        away -= np.round(away / maps[road].size) * maps[road].size
+        angles = [np.arctan2(part[..., SIN], part[..., COS]) for part in (cars[1:, None], others[1:])]
+        own, theirs = (
+            corners(np.dstack([x, y, h]).reshape(-1, 3), length / 2, width / 2)
+            for x, y, h in ((0 * there, 0 * there, angles[0] + 0 * there), (*away.transpose(2, 0, 1), angles[1]))
+        )
+        gaps = np.full(there.size, -np.inf)
+        for h in angles:
+            for turn in (0.0, math.pi / 2):
+                axis = np.stack([np.cos(h + turn), np.sin(h + turn)], -1) + 0 * away
+                a, b = (part @ axis.reshape(-1, 2, 1) for part in (own, theirs))
+                gaps = np.maximum(gaps, np.maximum(b.min((1, 2)) - a.max((1, 2)), a.min((1, 2)) - b.max((1, 2))))
+        assert result["gap"] == pytest.approx(max(gaps[there.ravel()].min(), 0.0), abs=2e-3)
+        unit = np.stack([np.cos(angles[0]), np.sin(angles[0])], -1)
+        ahead, aside = (away * unit).sum(-1), np.abs(away[..., 1] * unit[..., 0] - away[..., 0] * unit[..., 1])
+        close = (there & (ahead > 0) & (aside < width) & (ahead - length < speed[1:, None])).any(axis=1)
+        assert result["close"] == pytest.approx(close.sum() * dt, abs=2.1 * dt)
+    assert results["close"].max() > 0.3
+    assert not plain["lateral"].any()
+    alone, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds[:, :0], with_comfort=True)
+    assert np.isinf(alone["gap"]).all()
 
 
 def test_without_room_for_anybody_there_is_no_traffic(among):
