@@ -190,8 +190,8 @@ def normalise(constants, speed_at, observation):
     """Turn an observation (`gridsim.sensing.observation`) into the network's inputs, in place.
 
     Ranges r (m; of small cars in their unit) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds,
-    the speed, which is number `speed_at`, and the steering angle follow; a network without `+steering` does not read the
-    angle.
+    the speed, which is number `speed_at`, and the steering angle follow; a network without `+steering` does not read
+    the angle.
     """
     for i in range(RAYS):
         reach = observation[i] * constants.ray_range

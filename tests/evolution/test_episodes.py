@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from oracle import corners
+from pictures import cars_on
 from scipy import stats
 from searching import to_bytes
 
@@ -15,26 +17,28 @@ from cluster.workers.worker import Task, Worker
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.curriculum import Curriculum, CurriculumConfig
 from evolution.episodes.fitness import PACED_ENOUGH, scalar
-from evolution.episodes.rollout import RESULT, collect, evaluate, trajectory
+from evolution.episodes.rollout import EPISODE, RESULT, collect, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, encode, outputs_of
+from evolution.networks.policy import PolicySpec, act_on, normalise
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import SimConfig, constants
+from gridsim.maps.map import starts_at
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
+from gridsim.sensing.observation import observations
 from gridsim.simulator import Simulator
 from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
+K = constants(CONFIG)
 CARS = 8
 TARGET, STEPS = 1000.0, 1700
 
 
 def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
-    ranges, speeds = simulator.ranges, simulator.cars[:, SPEED].copy()
-    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds), CONFIG).argmax(axis=1)
+    return act_on(spec, genome, observations(K, simulator.ranges, None, simulator.cars, False), CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +128,56 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         assert again.ends[0] == End.COLLISION
 
 
+def test_what_is_rewound_of_an_episode_without_a_step_is_its_start(among):
+    spec, genome, maps, episodes, worlds, _ = among
+    wanted = episodes[:1].copy()
+    wanted["rewind"], wanted["steps"] = 40, 60
+    both = np.stack([genome, np.full_like(genome, math.nan)])
+    results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds[:1])
+    assert results["steps"].tolist() == [[60], [0]]
+    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99], abs=1e-4)
+    assert then[1].tobytes() == worlds[:1].tobytes()
+
+
+def test_figures_of_comfort_are_those_of_the_states_driven(among):
+    spec, genome, maps, episodes, worlds, paths = among
+    plain, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds)
+    results, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds, with_comfort=True)
+    names = ["distance", "paced", "steps", "end"]
+    assert results[names].tolist() == plain[names].tolist()
+    dt, length, width = 0.1, 4.0, 2.0
+    for result, road, (_, states, traffic) in zip(results[0], episodes["map"], paths, strict=True):
+        cars, others = states.astype(float), traffic.astype(float)
+        heading, speed = np.unwrap(np.arctan2(cars[:, SIN], cars[:, COS])), cars[:, SPEED]
+        across, along = np.diff(heading) / dt * (speed[1:] + speed[:-1]) / 2, np.diff(speed) / dt
+        assert result["lateral"] == pytest.approx(np.mean(across**2), rel=1e-3)
+        assert result["lateral_peak"] == pytest.approx(np.abs(across).max(), rel=1e-3)
+        jerks = np.diff(across) ** 2 + np.diff(along) ** 2
+        assert result["jerk"] == pytest.approx(np.mean(jerks) / dt**2, rel=1e-3)
+        away, there = others[1:, :, [X, Y]] - cars[1:, None, [X, Y]], others[1:, :, LANE] >= 0
+        away -= np.round(away / maps[road].size) * maps[road].size
+        angles = [np.arctan2(part[..., SIN], part[..., COS]) for part in (cars[1:, None], others[1:])]
+        own, theirs = (
+            corners(np.dstack([x, y, h]).reshape(-1, 3), length / 2, width / 2)
+            for x, y, h in ((0 * there, 0 * there, angles[0] + 0 * there), (*away.transpose(2, 0, 1), angles[1]))
+        )
+        gaps = np.full(there.size, -np.inf)
+        for h in angles:
+            for turn in (0.0, math.pi / 2):
+                axis = np.stack([np.cos(h + turn), np.sin(h + turn)], -1) + 0 * away
+                a, b = (part @ axis.reshape(-1, 2, 1) for part in (own, theirs))
+                gaps = np.maximum(gaps, np.maximum(b.min((1, 2)) - a.max((1, 2)), a.min((1, 2)) - b.max((1, 2))))
+        assert result["gap"] == pytest.approx(max(gaps[there.ravel()].min(), 0.0), abs=2e-3)
+        unit = np.stack([np.cos(angles[0]), np.sin(angles[0])], -1)
+        ahead, aside = (away * unit).sum(-1), np.abs(away[..., 1] * unit[..., 0] - away[..., 0] * unit[..., 1])
+        close = (there & (ahead > 0) & (aside < width) & (ahead - length < speed[1:, None])).any(axis=1)
+        assert result["close"] == pytest.approx(close.sum() * dt, abs=2.1 * dt)
+    assert results["close"].max() > 0.3
+    assert not plain["lateral"].any()
+    alone, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds[:, :0], with_comfort=True)
+    assert np.isinf(alone["gap"]).all()
+
+
 def test_without_room_for_anybody_there_is_no_traffic(among):
     spec, genome, maps, episodes, _, _ = among
     absent = np.zeros((9, CARS, TRAFFIC_FIELDS), dtype=F)
@@ -170,20 +224,27 @@ def cut_up(experience):
     return [Experience(*parts) for parts in zip(*(np.split(array, ends[:-1]) for array in experience), strict=True)]
 
 
+def inputs_of(simulator):
+    """What the environment shows of its one car, as a network with all inputs reads it."""
+    inputs = observations(K, simulator.ranges, simulator.closing, simulator.cars, True)[0]
+    normalise(K, 62, inputs)
+    return inputs
+
+
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
 def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, cars):
     of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
     inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
-    row, table, seen = 0, grid_table(CONFIG), np.zeros(64, dtype=F)
+    row, table = 0, grid_table(CONFIG)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
         simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars)
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
-        car, ranges, ends = simulator.cars[0], simulator.ranges, simulator.ends
+        ranges, ends = simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
-            encode(constants(CONFIG), ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
+            seen = inputs_of(simulator)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
             assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
             row += 1
@@ -195,6 +256,22 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
             assert experience.ends[row - 1] == ends[0]
         assert ends[0] == result["end"]
     assert row == len(experience.actions) > 150
+
+
+def test_a_network_reads_the_closing_speeds_that_the_environment_shows():
+    """Also those above the 30 m/s at which an observation ends: of a car that comes at 25 m/s."""
+    road, spec = build("highway", 4), PolicySpec.parse("mlp:3+motion+steering")
+    world = cars_on(road.network, (1, 10.0, 25.0, 1.0))
+    episode = np.zeros(1, dtype=EPISODE)
+    episode["start"], episode["target"], episode["steps"] = starts_at(road, np.zeros(1)), TARGET, 1
+    episode["start"][0, :2] = world[0, [X, Y]] + 20.0 * world[0, [COS, SIN]]
+    episode["start"][0, 2:4] = math.atan2(world[0, SIN], world[0, COS]) + math.pi, 20.0
+    genome = np.ones(spec.size, F)
+    experience, _ = collect(spec, genome, [road], episode, np.zeros(1, F), np.zeros(1, np.uint64), CONFIG, world[None])
+    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1)
+    simulator.reset(road, episode["start"], worlds=world[None])
+    assert simulator.closing.max() == pytest.approx(45.0, abs=0.1)
+    np.testing.assert_allclose(experience.observations[0] / 4096, inputs_of(simulator), rtol=0.0, atol=0.6 / 4096)
 
 
 @pytest.mark.parametrize("cars", [0, CARS])

@@ -26,8 +26,10 @@ from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.sensing.observation import encode
 
 F = np.float32
+K = constants(SimConfig())
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
 TEXTS = ["mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8", *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS))]
 
@@ -89,7 +91,9 @@ def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
 
 def test_what_the_network_sees():
     inputs, ranges = np.zeros(33, dtype=F), np.linspace(0, 50, 31)
-    policy.encode(constants(SimConfig()), ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    encode(K, ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    assert inputs == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
+    policy.normalise(K, 31, inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
     assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
@@ -202,11 +206,8 @@ def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, se
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
     genome = new_genomes(spec, seed=seed)[0]
 
-    def outputs(seen):
-        closing, speeds = 20.0 * seen[:, RAYS : 2 * RAYS], 20.0 * seen[:, 2 * RAYS if spec.motion else RAYS]
-        return outputs_of(spec, genome, 50.0 * seen[:, :RAYS], closing, speeds, 0.5 * seen[:, -1], SimConfig())
-
-    one, other = outputs(observations), outputs(in_a_mirror(spec, observations))
+    both = observations, in_a_mirror(spec, observations)
+    one, other = (outputs_of(spec, genome, seen, SimConfig()) for seen in both)
     assert np.abs(one).max() > 0.1
     np.testing.assert_allclose(one[:, MIRRORED_ACTIONS], other, atol=1e-4)
 
@@ -278,12 +279,7 @@ def test_perceptrons_give_the_kernels_outputs(text, config):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, MlpSpec)
     genome, observations = rays(spec)
-    speed, angle = F(config.vehicle.speed_limit), F(math.radians(config.vehicle.steering_limit))
-    at = 2 * RAYS if spec.motion else RAYS
-    expected = outputs_of(
-        spec, genome, observations[:, :RAYS] * F(config.sensors.range), observations[:, RAYS:at] * speed,
-        observations[:, at] * speed, observations[:, -1] * angle, config,
-    )  # fmt: skip
+    expected = outputs_of(spec, genome, observations, config)
     close = {"rtol": 0.0, "atol": 1e-5 * np.abs(expected).max()}
     found = run(to_onnx(spec, genome, config), observation=observations)
     assert (found.shape, found.dtype) == ((300, 8), F)
