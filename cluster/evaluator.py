@@ -94,7 +94,7 @@ class Evaluator:
         are the same bits for any number of workers.
         Raises: GridSimError for genomes that do not fit.
         """
-        return self._drive(genomes, self._draw(seed))
+        return self._drive(genomes, self._draw(seed), comfort=True)
 
     def fitness(self, genomes: np.ndarray, seed: int = 0) -> np.ndarray:
         """The scores float64 [n] of gridsim-evolve, in [0, 1], higher is better; otherwise as `evaluate`."""
@@ -117,12 +117,12 @@ class Evaluator:
         maps = [self._maps.get(each) for each in seeds]
         return Episodes(seeds, *lane_starts(maps, local, rng, self._settings.traffic, self._sim))
 
-    def _drive(self, genomes: np.ndarray, episodes: Episodes) -> np.ndarray:
+    def _drive(self, genomes: np.ndarray, episodes: Episodes, comfort: bool = False) -> np.ndarray:
         members = Generation(np.zeros((0, self.genes), np.float32), recipes(0)).and_copies(self._checked(genomes))
         scenario = self._settings.scenario
         names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
         shared = str(self.spec), episodes.rows, episodes.worlds, names, self._sim
-        task = Task(*shared, parents=members.parents, key=members.key, mutation=members.mutation)
+        task = Task(*shared, members.parents, members.key, members.mutation, comfort)
         return self._pool.run(Outcome(task, members.recipes)).results
 
     def _checked(self, genomes: np.ndarray) -> np.ndarray:

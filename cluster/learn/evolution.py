@@ -52,6 +52,10 @@ class Evolution(Learning):
         if self.initial is not None:
             self.search.start_from(self.initial)
 
+    @property
+    def comfort(self) -> bool:
+        return bool(self.settings.fitness)  # which may need them
+
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes the worst."""
         score = self._fitness(results, target)

@@ -85,6 +85,11 @@ class Learning(ABC):
         self.spec = PolicySpec.parse(s.policy)
         self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim, s.traffic)
 
+    @property
+    def comfort(self) -> bool:
+        """Whether episodes' results have figures of comfort."""
+        return False
+
     @abstractmethod
     def step(self) -> Progress:
         """Do one step and add its row to the history, without the wall clock's columns."""
@@ -157,7 +162,7 @@ class Learning(ABC):
         self, stage: str, members: Generation, episodes: Episodes, asked: Sequence[Chunk] | None = None,
         train: Callable[[], bool] = lambda: False,
     ) -> Generator[Event, None, Outcome]:  # fmt: skip
-        task = Task(*self._base(episodes), members.parents, members.key, members.mutation)
+        task = Task(*self._base(episodes), members.parents, members.key, members.mutation, self.comfort)
         outcome = self.pool.start(Outcome(task, members.recipes, asked))
         yield from self._wait(stage, outcome, train)
         self.car_steps += int(outcome.results["steps"].sum())

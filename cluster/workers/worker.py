@@ -36,6 +36,7 @@ class Task(_Common):
     parents: np.ndarray  # genomes float32 [parents, genes] that the recipes name
     key: int  # the generation's number for breeding, 64 bits
     mutation: Mutation  # how children differ from their parents
+    comfort: bool = False  # whether results have figures of comfort, which take time
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Worker:
         """What `rollout.evaluate` returns for recipes RECIPE [n]."""
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, space(spec), task.mutation)
-        return evaluate(spec, genomes, maps, task.episodes, task.config, task.worlds)
+        return evaluate(spec, genomes, maps, task.episodes, task.config, task.worlds, task.comfort)
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
         """What `rollout.collect` returns."""
