@@ -13,7 +13,8 @@ WEIGHT = 0.2
 
 def soft(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
     """Scores [members] of results [members, episodes]: the usual fitness, less what is harsh, of which those
-    who drive far are charged most."""
+    who drive far are charged most.
+    """
     driven = np.minimum(scalar(results, targets), 1.0)
     harsh = np.minimum(results["lateral"].mean(axis=1, dtype=np.float64) / HARSH, 1.0)
     return driven - WEIGHT * driven**2 * harsh

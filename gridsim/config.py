@@ -36,7 +36,7 @@ CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; 
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight, as a share of lower + upper speed: the middle of the interval
 SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
 SPAWN_SPEED = _F(0.5)  # share of the desired speed, at the start of an episode
-LANE_CHANGE_PERIOD = _F(10.0)  # control steps between two decisions whether to change lanes
+LANE_CHANGE_PERIOD = 1.0  # s between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
 NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance: tolerance of the ego car's lane, judged along a straight line
 # A car looks ahead the jam distance, LOOK_AHEAD m, the distance driven in LOOK_AHEAD_TIME s, and that of braking.

@@ -24,7 +24,7 @@ PACE = 0.9  # speed on a straight: 0 is the lower end of the scenario's speed in
 LATERAL = 3.2  # m/s2 in bends, below the grip limit
 ACCELERATION = 3.0  # m/s2
 BRAKING = 2.5  # m/s2 before bends
-WINDOW = 10.0  # m of a path over which its curvature is measured, because a driver's steering is jerky
+WINDOW = 10.0  # units (`SimConfig.unit`) of a path over which its curvature is measured: a driver's steering is jerky
 _STANDING = 1e-6  # m
 
 
@@ -33,18 +33,18 @@ def arc_length(points: np.ndarray) -> np.ndarray:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def curvature_along(points: np.ndarray, arc: np.ndarray) -> np.ndarray:
-    """Curvature (1/m) at points [n, 2] of a path, from the chords of `WINDOW` / 2 m before and after each.
+def curvature_along(points: np.ndarray, arc: np.ndarray, window: float = WINDOW) -> np.ndarray:
+    """Curvature (1/m) at points [n, 2] of a path, from the chords of `window` / 2 m before and after each.
 
-    Near the path's ends it is that of the nearest point with `WINDOW` / 4 m on either side.
+    Near the path's ends it is that of the nearest point with `window` / 4 m on either side.
     """
 
     def point(s: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(s, arc, axis) for axis in points.T])
 
-    least = min(WINDOW, arc[-1] - arc[0]) / 4
+    least = min(window, arc[-1] - arc[0]) / 4
     middle = np.clip(arc, arc[0] + least, arc[-1] - least)
-    back, front = np.maximum(middle - WINDOW / 2, arc[0]), np.minimum(middle + WINDOW / 2, arc[-1])
+    back, front = np.maximum(middle - window / 2, arc[0]), np.minimum(middle + window / 2, arc[-1])
     (ax, ay), (bx, by) = point(middle) - point(back), point(front) - point(middle)
     return np.arctan2(ax * by - ay * bx, ax * bx + ay * by) / ((front - back) / 2)
 
@@ -56,14 +56,18 @@ def top_speed(interval: tuple[float, float]) -> float:
 
 
 def profile(
-    points: np.ndarray, interval: tuple[float, float], start_speed: float, vehicle: VehicleConfig
+    points: np.ndarray,
+    interval: tuple[float, float],
+    start_speed: float,
+    vehicle: VehicleConfig,
+    window: float = WINDOW,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Speed (m/s) and steering (rad, left positive) of the reference along a driven path: float64 [n] each.
 
     Args: points [n, 2] in m, in order, all different, not wrapped over the torus; speed at the first point, m/s.
     """
     arc = arc_length(points)
-    curvature = curvature_along(points, arc)
+    curvature = curvature_along(points, arc, window)
     squared = np.minimum(top_speed(interval) ** 2, LATERAL / np.maximum(np.abs(curvature), 1e-9))
     braking = 2.0 * BRAKING * arc
     squared = np.minimum.accumulate((squared + braking)[::-1])[::-1] - braking
@@ -134,7 +138,8 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
     points, (driven_speed, driven_steering) = points[rows], poses[rows, 3:].T
     arc = arc_length(points)
     interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
-    speed, steering = profile(points, interval, float(driven_speed[0]), vehicle)
+    window = WINDOW * float(road_map.road.unit)
+    speed, steering = profile(points, interval, float(driven_speed[0]), vehicle, window)
     unknown = np.flatnonzero(arc + speed**2 / (2.0 * BRAKING) > arc[-1])
-    part = slice(int(np.searchsorted(arc, WINDOW / 2)), int(unknown[0]))
+    part = slice(int(np.searchsorted(arc, window / 2)), int(unknown[0]))
     return Series(arc[part], driven_speed[part], speed[part], driven_steering[part], steering[part])

@@ -101,7 +101,7 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
         "height": float(road_map.road.height),
         "torus": road_map.torus,
         "view": bounds(road_map),
-        "interval": [float(road_map.road.speed_low), float(road_map.road.speed_high)],
+        "interval": [round(float(road_map.road.speed_low), 2), round(float(road_map.road.speed_high), 2)],
         "fastest": 1.2 * float(road_map.road.speed_high),
         "car": [last.sim.vehicle.length / unit, last.sim.vehicle.width / unit],
         "sensor": float(constant.front_axle) / unit,

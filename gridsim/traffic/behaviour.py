@@ -20,7 +20,7 @@ from gridsim.jit import HALF, ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
 from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
-from gridsim.traffic.world import choose_lane, lane_after, point_at, set_pose
+from gridsim.traffic.world import choose_lane, lane_after, lane_change_steps, point_at, set_pose
 
 
 class Drivers(NamedTuple):
@@ -40,14 +40,17 @@ class Drivers(NamedTuple):
     half_length: np.float32  # m
     half_width: np.float32  # m
     dt: np.float32  # s
+    lane_change_steps: np.float32  # control steps between two decisions whether to change lanes
     ego: Constants  # of the ego car, to predict its motion
 
 
 def drivers(sim: SimConfig) -> Drivers:
     """The configuration for the kernels."""
     traffic = {name: np.float32(value) for name, value in vars(sim.traffic).items() if name in Drivers._fields}
-    k = constants(sim)
-    return Drivers(**traffic, half_length=k.half_length, half_width=k.half_width, dt=k.dt, ego=k)
+    k, steps = constants(sim), F(lane_change_steps(sim))
+    return Drivers(
+        **traffic, half_length=k.half_length, half_width=k.half_width, dt=k.dt, lane_change_steps=steps, ego=k
+    )
 
 
 @leaf
@@ -226,7 +229,7 @@ def change_lanes(network, drivers, world, i, ego):
     if car[s.LANE_TIMER] > ZERO:
         car[s.LANE_TIMER] -= ONE
         return
-    car[s.LANE_TIMER] = config.LANE_CHANGE_PERIOD - ONE
+    car[s.LANE_TIMER] = drivers.lane_change_steps - ONE
     lane = I(car[s.LANE])
     if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0:
         _choose_neighbour(network, drivers, world, i, ego)

@@ -83,13 +83,13 @@ def choose_lane(network, lane, car):
 
 
 @njit(nogil=True)
-def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
+def _spawn(network, mileage, first, start, key, gap, ego_gap, lane_change_steps, world):
     """Spawn an empty world's cars, uniformly over the lanes from `first` m on, apart from each other and the ego."""
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
         car[s.JUNCTION_BEHIND], car[s.PERMIT] = -ONE, -ONE
-        car[s.LANE_TIMER] = F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
+        car[s.LANE_TIMER] = F(i) % lane_change_steps  # spreads the decisions over the control steps
         for _ in range(60):
             draws += 1
             bits = mix(key + U(draws) * GOLDEN)
@@ -116,6 +116,11 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
             car[s.LANE] = -ONE
 
 
+def lane_change_steps(config: SimConfig) -> int:
+    """Control steps between a car's decisions whether to change lanes."""
+    return max(round(LANE_CHANGE_PERIOD / config.episode.control_period), 1)
+
+
 def check_traffic(cars: int, config: SimConfig) -> None:
     """Raises: GridSimError if so many other cars cannot drive, because they are too small for what traffic assumes."""
     if cars and config.unit < 1.0:
@@ -139,7 +144,7 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
         first = np.where(behind, half, 0.0)
         last = lengths - np.where(before, half + float(STOP_LINE_GAP), 0.0)
         mileage = np.concatenate([[0.0], np.cumsum(np.where(junction, 0.0, np.maximum(last - first, 0.0)))])
-        gaps = F(traffic.spawn_gap), F(traffic.spawn_gap_ego)
+        gaps = F(traffic.spawn_gap), F(traffic.spawn_gap_ego), F(lane_change_steps(config))
         for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
             _spawn(network, mileage, first, start, U(key), *gaps, world)
     return worlds

@@ -21,7 +21,7 @@ from evolution.episodes.rollout import EPISODE, RESULT, collect, evaluate, traje
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, act_on, normalise
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.config import SimConfig, constants
+from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.maps.map import starts_at
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
@@ -339,6 +339,15 @@ TASK = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2
 @pytest.fixture
 def curriculum():
     return Curriculum(TASK, 7, lambda seed: build("seamless", seed), CONFIG, traffic=2)
+
+
+def test_full_episodes_are_those_of_the_runs_simulator():
+    sim = SimConfig(episode=EpisodeConfig(target=30.0, time_limit=20.0, control_period=0.05))
+    own = Curriculum(TASK, 7, lambda seed: build("seamless", seed), sim)
+    for full in (own.starts(0, 4), own.validation(range(2))):
+        assert {(row["target"], row["steps"]) for row in full.rows} == {(30.0, 400)}
+    own._limit(full.rows, 14.0)
+    assert set(full.rows["steps"]) == {math.ceil((14.0 / TASK.pace + TASK.slack) / 0.05)}
 
 
 def led(curriculum, generation, ends, distance=0.0, steps=50):
