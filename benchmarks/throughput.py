@@ -88,7 +88,7 @@ def _actions(packed, layers, constants, ranges, speeds, actions):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for i in range(len(actions)):
         encode(constants, ranges[i], None, speeds[i], np.float32(0.0), scratch)
-        normalise(constants, ranges.shape[1], scratch)
+        normalise(constants, ranges.shape[1], ranges.shape[1], scratch)
         actions[i] = decide(packed, layers, scratch)
 
 

@@ -144,7 +144,7 @@ def _observe(simulation, car, world, workspace, closing, grid_buffers):
     if grid_buffers is None:
         encode(simulation.constants, workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
         rays = workspace.ranges.shape[0]
-        normalise(simulation.constants, rays if closing is None else 2 * rays, workspace.scratch)
+        normalise(simulation.constants, rays, rays if closing is None else 2 * rays, workspace.scratch)
     else:
         fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
 

@@ -186,18 +186,18 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
 
 @exact
-def normalise(constants, speed_at, observation):
+def normalise(constants, rays, speed_at, observation):
     """Turn an observation (`gridsim.sensing.observation`) into the network's inputs, in place.
 
     Ranges r (m; of small cars in their unit) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds,
     the speed, which is number `speed_at`, and the steering angle follow; a network without `+steering` does not read
     the angle.
     """
-    for i in range(RAYS):
+    for i in range(rays):  # a number known to the compiler would be unrolled, and not vectorised
         reach = observation[i] * constants.ray_range
         observation[i] = F(2.0) * reach / (reach + RAY_HALF * constants.unit) - F(1.0)
     scale = constants.speed_limit / (SPEED_SCALE * constants.pace)
-    for i in range(RAYS, speed_at):
+    for i in range(rays, speed_at):
         observation[i] = observation[i] * scale
     observation[speed_at] = observation[speed_at] * scale - F(1.0)
     observation[speed_at + 1] = observation[speed_at + 1] * (constants.steering_limit / STEERING_SCALE)
@@ -319,7 +319,7 @@ def _outputs(packed, layers, constants, speed_at, observations, outputs):
     for n in range(observations.shape[0]):
         for i in range(observations.shape[1]):
             scratch[i] = observations[n, i]
-        normalise(constants, speed_at, scratch)
+        normalise(constants, RAYS, speed_at, scratch)
         first = forward(packed, layers, scratch)
         outputs[n] = scratch[first : first + outputs.shape[1]]
 

@@ -227,7 +227,7 @@ def cut_up(experience):
 def inputs_of(simulator):
     """What the environment shows of its one car, as a network with all inputs reads it."""
     inputs = observations(K, simulator.ranges, simulator.closing, simulator.cars, True)[0]
-    normalise(K, 62, inputs)
+    normalise(K, 31, 62, inputs)
     return inputs
 
 

@@ -93,7 +93,7 @@ def test_what_the_network_sees():
     inputs, ranges = np.zeros(33, dtype=F), np.linspace(0, 50, 31)
     encode(K, ranges.astype(F), None, F(12.5), F(-0.1), inputs)
     assert inputs == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
-    policy.normalise(K, 31, inputs)
+    policy.normalise(K, 31, 31, inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
     assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
