@@ -68,8 +68,8 @@ def evolve(
         settings: what the command's flags set; alternatively give these by name, such as scenario="city".
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
             with fields distance (m), paced (m at a speed within the interval), steps, end (`gridsim.state.End`) and
-            figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default: `fitness.scalar`
-            of evolution.episodes.
+            figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
+            `evolution.episodes.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process, on all its cores.
         on_generation: called with the number of generations done and the latest one's figures.
         folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
