@@ -31,9 +31,11 @@ from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
 from gridsim.maps.map import blank, sample_starts
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
+from gridsim.sensing.imperfections import imperfections
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
+OWN = "fitness"  # stands for a fitness of the user's own
 PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
 
 
@@ -42,9 +44,18 @@ def _marker(settings: RunSettings) -> Path:
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
+    sim = settings.simulator()
+    noisy, late = (part is not None for part in imperfections(sim))
+    chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", "noisy": noisy, "late": late, OWN: has_own(settings)}
+    special = "".join(f"{name}-" for name, there in chosen.items() if there)
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
     cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()
-    return CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}"
+    return CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{special}{settings.command}-{cpu}"
+
+
+def has_own(settings: RunSettings) -> bool:
+    """Whether a run has a fitness of its own, for which episodes' results have figures of comfort."""
+    return isinstance(settings, EvolveSettings) and bool(settings.fitness)
 
 
 def is_compiled(settings: RunSettings) -> bool:
@@ -55,6 +66,7 @@ def is_compiled(settings: RunSettings) -> bool:
 def compile_ahead(settings: RunSettings) -> None:
     """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
     what = [settings.scenario, settings.sim, settings.policy, str(settings.traffic), settings.command]
+    what += [OWN] if has_own(settings) else []
     compilers = list[Child]()
     try:
         for part in PARTS:  # -P: not from this folder
@@ -70,7 +82,7 @@ def compile_ahead(settings: RunSettings) -> None:
             compiler.close(0.0)
 
 
-def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, command: str) -> None:
+def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, command: str, own: str = "") -> None:
     """Compile one of PARTS in this process, or load it from the cache, by the smallest drive: one step, on no road."""
     config, spec, road = SimConfig.load(sim), PolicySpec.parse(policy), blank()
     genome, keys = np.zeros(spec.size, dtype=np.float32), np.zeros(1, dtype=np.uint64)
@@ -80,7 +92,7 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
     if part == "kernels":
         shared, made = (policy, episodes, worlds, (), config), recipes(2)
         made["kind"] = Kind.NEW
-        Worker().answer(Task(*shared, genome[None], 1, Mutation()), [road], made, slice(0, 1))
+        Worker().answer(Task(*shared, genome[None], 1, Mutation(), bool(own)), [road], made, slice(0, 1))
         if command == DqnSettings.command:
             Worker().answer(
                 CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
@@ -107,8 +119,8 @@ def everything_by_default() -> list[RunSettings]:
 def main(part: str, *what: str) -> None:
     """Compile one part, or everything, in this process."""
     if part != "everything":
-        scenario, sim, policy, traffic, command = what
-        compile_part(part, scenario, sim, policy, int(traffic), command)
+        scenario, sim, policy, traffic, *rest = what
+        compile_part(part, scenario, sim, policy, int(traffic), *rest)
         return
     for settings in everything_by_default():
         for each in PARTS:
