@@ -306,7 +306,9 @@ def _evaluate() -> int:
     if flags.json:
         more: dict[str, Any] = {} if missed is None else {"errors": missed}
         if found:
-            more["stress"] = [{"what": each.name, "level": level, **driven} for each, level, driven in found]
+            more["stress"] = [
+                {"what": f"{each.part}.{each.name}", "level": level, **driven} for each, level, driven in found
+            ]
         print(json.dumps({**figures, **more}))
         return 0
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
