@@ -155,7 +155,7 @@ def test_watch_shows_a_recorded_drive(here, monkeypatch, capsys):
         assert f"{pictures / 10:.1f} s, {pictures} pictures" in call(watch_main, monkeypatch, capsys, *film)[1]
         assert probe(here / "d.mp4")[5] == pictures
     (here / "cut.csv").write_text((here / "drive.csv").read_text()[:-30])
-    for line, said in (("cut.csv", "cut.csv, line 28"), ("drive.csv --generation 1", "its own driver and road")):
+    for line, said in (("cut.csv", "cut.csv, line 28"), ("drive.csv --generation 1", "its own driver, car and road")):
         assert said in refused(watch_main, monkeypatch, capsys, *line.split(), "--output", "e.mp4")[0]
 
 
