@@ -15,7 +15,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table
 from gridsim.simulator import Simulator
-from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEPS, End, X, Y
+from gridsim.state import DISTANCE, SPEED, STEPS, End, X, Y
 from gridsim.view.render import Renderer
 
 DEFAULT = SimConfig()
@@ -163,7 +163,8 @@ def test_a_car_of_an_eighth_on_a_map_of_an_eighth_drives_an_eighth_bit_for_bit(t
                 (simulator.cars[:, [X, Y, SPEED, DISTANCE]] * scale, simulator.ranges * scale, simulator.ends.copy())
             )
         renderer, path = Renderer(road_map, (160, 120), config), simulator.cars[1:9, :2]
-        beside = simulator.cars[:1] + np.array([4.0 / scale, *[0.0] * (CAR_FIELDS - 1)])
+        beside = simulator.cars[:1].copy()
+        beside[:, X] += 4.0 / scale
         drawn = renderer.draw(simulator.cars[0], beside, simulator.ranges[0], path)
         runs.append((drawn, road_map.starts * [scale, scale, 1, 1, 1], *map(np.stack, zip(*states, strict=True))))
     for large, small in zip(*runs, strict=True):
