@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 RUNS = {
     "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
     "faults.py": (
-        ["--faults", "4", "--jobs", "2", "--json"],
+        ["--faults", "4", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
     "faults.py --cluster": (["--faults", "2", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
