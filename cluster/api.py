@@ -47,7 +47,7 @@ Trained = tuple[Champion, list[dict[str, float]]]
 
 def evolve(
     settings: EvolveSettings | None = None,
-    fitness: Fitness | None = None,
+    fitness: Fitness | str | None = None,
     workers: int = 0,
     on_generation: OnStep | None = None,
     *,
@@ -69,7 +69,7 @@ def evolve(
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
             with fields distance (m), paced (m at a speed within the interval), steps, end (`gridsim.state.End`) and
             figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
-            `evolution.episodes.fitness.scalar`.
+            `evolution.episodes.fitness.scalar`. A name, as of --fitness, is found as the command finds it.
         workers: Ray workers on this machine; 0 evaluates in this process, on all its cores.
         on_generation: called with the number of generations done and the latest one's figures.
         folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
@@ -82,8 +82,8 @@ def evolve(
     Raises: GridSimError; the message is one line.
     """
     settings = settings or EvolveSettings(**flags)
-    if fitness is not None:
-        settings = replace(settings, fitness=give(fitness))
+    if fitness:
+        settings = replace(settings, fitness=fitness if isinstance(fitness, str) else give(fitness))
     return _train(settings, workers, on_generation, folder, resume, address, tracking_uri)
 
 

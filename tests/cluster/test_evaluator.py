@@ -1,7 +1,10 @@
 """`gridsim.Evaluator`: what a search of the user's own asks for."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from commands import finish
 
 import gridsim
 from evolution.episodes import fitness
@@ -26,21 +29,26 @@ def test_episodes_follow_from_the_seed_and_results_from_genome_and_episode_alone
     assert gridsim.evaluate(driver, episodes=4)["episodes"] == 4
 
 
-@pytest.mark.e2e
-def test_it_uses_a_ray_that_is_in_use_for_the_same_bits() -> None:
-    import ray
+IN_USE = """
+import numpy as np
+import ray
 
-    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
-    try:
-        found = []
-        for workers in (0, 2):
-            with gridsim.Evaluator("curved", policy="mlp:8", sim=SHORT, workers=workers) as evaluator:
-                genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
-                found.append(evaluator.evaluate(genomes).tobytes())
-        assert found[0] == found[1]
-        assert ray.is_initialized(), "it was not ours to shut down"
-    finally:
-        ray.shutdown()
+import gridsim
+
+ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False)
+found = []
+for workers in (0, 2):
+    with gridsim.Evaluator("curved", policy="mlp:8", workers=workers, episodes=4) as evaluator:
+        genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
+        found.append(evaluator.evaluate(genomes).tobytes())
+print(found[0] == found[1], ray.is_initialized())
+"""
+
+
+@pytest.mark.e2e
+def test_it_uses_a_ray_that_is_in_use_for_the_same_bits_and_leaves_it(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(IN_USE)
+    assert finish("python", "own.py", cwd=tmp_path).stdout.splitlines()[-1] == "True True"
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def early(results: np.ndarray, targets: Any) -> np.ndarray:
 @pytest.mark.parametrize("name", ["own.py:early", "own:early"])
 def test_it_is_found_by_name_and_decides_as_one_from_python_does(own: Path, name: str) -> None:
     wanted, history = gridsim.evolve(fitness=early, **SMALL)
-    named, _ = gridsim.evolve(gridsim.EvolveSettings(fitness=name, **SMALL))
+    named, _ = gridsim.evolve(fitness=name, **SMALL)
     assert named.sha256 == wanted.sha256 != gridsim.evolve(**SMALL)[0].sha256
     assert history[-1]["fitness/best"] < 0.0
 
