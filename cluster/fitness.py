@@ -81,7 +81,7 @@ def _file(name: str) -> Path:
         return Path(source)
     first, *others = source.split(".")
     with _working_folder():
-        found = importlib.util.find_spec(first)  # of `a.b` it would run `a`
+        found = importlib.util.find_spec(first)  # not of `a.b`, for which Python would run `a`
     if not found or not found.origin:
         raise ValueError
     path = Path(found.origin).parent.joinpath(*others) if others else Path(found.origin)
@@ -125,12 +125,13 @@ def _module_of_file(path: str) -> Any:
 
 @contextlib.contextmanager
 def _working_folder() -> Iterator[None]:
-    """Modules may lie in the working folder."""
-    sys.path.append(os.getcwd())
+    """Let modules be found in the working folder, too."""
+    folder = os.getcwd()
+    sys.path.append(folder)
     try:
         yield
     finally:
-        sys.path.remove(os.getcwd())
+        sys.path.remove(folder)
 
 
 def _place(function: Any) -> str:

@@ -62,10 +62,10 @@ class Evolution(Learning):
         return np.where(np.isfinite(score), score, -np.inf)
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
-        score, second = super()._standing(results)
+        score, tie_break = super()._standing(results)
         if self.settings.fitness:
             return min(score, self.settings.until), float(self._score(results, self.curriculum.goal)[0])
-        return score, second
+        return score, tie_break
 
     def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
         super()._judge(candidate, results, step)

@@ -54,7 +54,7 @@ class Champion:
     genome: np.ndarray  # float32 [genes]
     score: float = 0.0  # `Curriculum.validation_score`
     success_rate: float = 0.0
-    second: float = 0.0  # decides between equal scores: mean distance (m), or the mean of a fitness of the user's own
+    tie_break: float = 0.0  # between equal scores: mean distance (m), or the value of a fitness of the user's own
     step: int = -1  # in which it was found
 
 
@@ -138,9 +138,9 @@ class Learning(ABC):
         """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
         self.tried = candidate
         self.validation_steps += int(results["steps"].sum())
-        score, second = self._standing(results)
-        if self.champion is None or (score, second) > (self.champion.score, self.champion.second):
-            self.champion = Champion(candidate, score, float(success_rate(results)[0]), second, step)
+        score, tie_break = self._standing(results)
+        if self.champion is None or (score, tie_break) > (self.champion.score, self.champion.tie_break):
+            self.champion = Champion(candidate, score, float(success_rate(results)[0]), tie_break, step)
         self.solved = self.champion.score >= self.settings.until
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
@@ -198,7 +198,7 @@ class Learning(ABC):
             **{name: getattr(self, name) for name in self.checkpointed},
             **self.counts(),
             "columns": list(self.columns),  # of the history, which is also read without its learner
-            "champion": champion and [champion.score, champion.success_rate, champion.second, champion.step],
+            "champion": champion and [champion.score, champion.success_rate, champion.tie_break, champion.step],
         }
         return arrays, meta
 

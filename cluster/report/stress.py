@@ -35,8 +35,8 @@ STRESSES = (
     Stress("dropout, share of readings", "sensors", "dropout", (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)),
     Stress("latency of readings, s", "sensors", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
     Stress("latency of commands, s", "vehicle", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
-    Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
 )
+KINEMATIC = (Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),)
 DYNAMIC = (
     Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
     Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
@@ -45,10 +45,7 @@ DYNAMIC = (
 
 def stresses(champion: Champion) -> list[Stress]:
     """What can get worse for a champion's vehicle."""
-    dynamic = champion.sim.vehicle.model != "kinematic"
-    return [each for each in STRESSES if not (dynamic and each.name == "lateral_grip")] + list(
-        DYNAMIC if dynamic else ()
-    )
+    return [*STRESSES, *(KINEMATIC if champion.sim.vehicle.model == "kinematic" else DYNAMIC)]
 
 
 def drive(

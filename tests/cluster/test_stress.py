@@ -15,6 +15,7 @@ from cluster.store.champion import Champion
 from evolution.networks.policy import PolicySpec
 from gridsim.config import EpisodeConfig, SimConfig, VehicleConfig
 
+LEVELS = (*stress.STRESSES, *stress.KINEMATIC)
 SHORT = SimConfig(episode=EpisodeConfig(target=10.0, time_limit=20.0))
 
 
@@ -35,14 +36,14 @@ def test_each_level_is_measured_printed_and_drawn(
             evaluate_main()
         assert ended.value.code == 0
     printed, line = capsys.readouterr().out.rsplit("\n{", 1)
-    for each in stress.STRESSES:
+    for each in LEVELS:
         assert each.label in printed
     figures = json.loads("{" + line)
-    assert len(figures["stress"]) == sum(len(each.levels) for each in stress.STRESSES)
+    assert len(figures["stress"]) == sum(len(each.levels) for each in LEVELS)
     perfect = [
         row for row in figures["stress"] if row["level"] == (1.0 if row["what"] == "vehicle.lateral_grip" else 0.0)
     ]
-    assert len(perfect) == len(stress.STRESSES)
+    assert len(perfect) == len(LEVELS)
     for row in perfect:
         assert {name: row[name] for name in ("success_rate", "distance_m", "episodes")} == {
             name: figures[name] for name in ("success_rate", "distance_m", "episodes")

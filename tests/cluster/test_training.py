@@ -144,7 +144,7 @@ def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_ma
         finish(evolution.choose_champion())
         assert evolution.car_steps == before
         assert evolution.champion.genome.tobytes() == two[metres.argmax()].tobytes()
-        assert (evolution.champion.score, evolution.champion.second) == (0.0, metres.max())
+        assert (evolution.champion.score, evolution.champion.tie_break) == (0.0, metres.max())
 
 
 def test_training_is_among_more_cars_than_validation(maps):
