@@ -9,12 +9,12 @@ import numpy as np
 
 from gridsim.car.models import Model
 from gridsim.car.reward import reward
-from gridsim.car.vehicle import Action, act, act_continuous
+from gridsim.car.vehicle import NEUTRAL, Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import ZERO, F, I, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.imperfections import Delays, History, Imperfections, imperfections, late_command
+from gridsim.sensing.imperfections import Delays, History, Imperfections, imperfections_of, late_command
 from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 from gridsim.traffic.behaviour import Drivers
@@ -30,7 +30,7 @@ class Physics(NamedTuple):
     drivers: Drivers
     fan: np.ndarray
     model: Model
-    wrong: Imperfections | None
+    imperfections: Imperfections | None
     delays: Delays | None
 
 
@@ -38,8 +38,8 @@ class Physics(NamedTuple):
 def _on_map(physics, row):
     """The Simulation of a map of the atlas."""
     road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
-    k, drivers, fan, model, wrong, delays = physics[1:]
-    return Simulation(road, network, k, drivers, fan, model, wrong, delays)
+    k, drivers, fan, model, imperfections, delays = physics[1:]
+    return Simulation(road, network, k, drivers, fan, model, imperfections, delays)
 
 
 @njit
@@ -81,7 +81,7 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
             runs_on, history = ends[i] == 0, _history_of(histories, i)
             if runs_on:
                 if actions.ndim == 1:
-                    action, _ = late_command(history, car, F(actions[i]), ZERO, F(4.0))  # 4: none
+                    action, _ = late_command(history, car, F(actions[i]), ZERO, NEUTRAL)
                     acceleration, steering = act(constants, I(action), car[SPEED], car[STEERING])
                 else:
                     pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
@@ -144,7 +144,7 @@ class Simulator:
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._starts = np.zeros((cars, 5), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
-        delays, rays = imperfections(self.config)[1], self.config.sensors.rays
+        delays, rays = imperfections_of(self.config)[1], self.config.sensors.rays
         self._histories = delays and (
             np.zeros((cars, delays.readings, 2, rays), dtype=np.float32),
             np.zeros((cars, delays.commands, 2), dtype=np.float32),
@@ -191,8 +191,7 @@ class Simulator:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
         self._starts[cars] = starts
-        for i in cars.tolist():
-            self._drawn.pop(i, None)
+        self._drawn = {i: drawn for i, drawn in self._drawn.items() if i not in cars}
         arrays = self.cars, self.visits, self._traffic(), self.ranges, self.closing, self._histories
         for batch in self._batches(cars):
             _place_all(*batch, cars, starts, *arrays)

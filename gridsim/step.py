@@ -20,7 +20,7 @@ from gridsim.jit import ONE, ZERO, F, I, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
-from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections, late_readings
+from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_readings
 from gridsim.sensing.rays import cast_boxes, fan, sense
 from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
@@ -37,7 +37,7 @@ class Simulation(NamedTuple):
     drivers: Drivers
     fan: np.ndarray  # of `rays.fan`
     model: Model  # of the vehicle
-    wrong: Imperfections | None  # with the sensor
+    imperfections: Imperfections | None  # of the sensor
     delays: Delays | None
 
 
@@ -45,7 +45,7 @@ def parameters(config: SimConfig) -> tuple[Any, ...]:
     """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(config), rays, model_of(config.vehicle), *imperfections(config)
+    return k, drivers(config), rays, model_of(config.vehicle), *imperfections_of(config)
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
@@ -111,7 +111,7 @@ def look(simulation, car, world, ranges, closing, history):
         if closing is not None:
             velocity = front_velocity(simulation.model, constants, car)
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
-    degrade(simulation.wrong, constants.ray_range, car, ranges)
+    degrade(simulation.imperfections, constants.ray_range, car, ranges)
     late_readings(history, car, ranges, closing)
 
 

@@ -31,7 +31,7 @@ from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
 from gridsim.maps.map import blank, sample_starts
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
-from gridsim.sensing.imperfections import imperfections
+from gridsim.sensing.imperfections import imperfections_of
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
@@ -45,7 +45,7 @@ def _marker(settings: RunSettings) -> Path:
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
     sim = settings.simulator()
-    noisy, late = (part is not None for part in imperfections(sim))
+    noisy, late = (part is not None for part in imperfections_of(sim))
     chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", "noisy": noisy, "late": late, OWN: has_own(settings)}
     special = "".join(f"{name}-" for name, there in chosen.items() if there)
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.

@@ -17,7 +17,7 @@ from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
 from gridsim.car.reward import reward
-from gridsim.car.vehicle import act
+from gridsim.car.vehicle import NEUTRAL, act
 from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
@@ -195,7 +195,7 @@ def _drive(simulation, setup, car, workspace, world, action):
 
     A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
-    late, _ = late_command(workspace.history, car, F(action), ZERO, F(4.0))  # 4: none
+    late, _ = late_command(workspace.history, car, F(action), ZERO, NEUTRAL)
     acceleration, steering = act(simulation.constants, I(late), car[SPEED], car[STEERING])
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
 

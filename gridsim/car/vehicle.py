@@ -30,6 +30,9 @@ class Action(IntEnum):
     REVERSE = 7
 
 
+NEUTRAL = F(Action.NONE)  # what a car does before the first command that comes late
+
+
 @leaf
 def brake(constants, most, speed):
     """Acceleration (m/s2) when braking by `most` m/s2, or by less if the car would stop within the control period."""

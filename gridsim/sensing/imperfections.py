@@ -41,31 +41,31 @@ class History(NamedTuple):
     commands: np.ndarray  # float32 [steps, 2]
 
 
-def imperfections(config: SimConfig) -> tuple[Imperfections | None, Delays | None]:
-    """Those of a configuration; None for a perfect sensor, and for no delay."""
-    sensors, period, wrong = config.sensors, config.episode.control_period, None
+def imperfections_of(config: SimConfig) -> tuple[Imperfections | None, Delays | None]:
+    """A configuration's imperfections, None for a perfect sensor, and its delays, None if there are none."""
+    sensors, period, found = config.sensors, config.episode.control_period, None
     if sensors.noise or sensors.noise_share or sensors.dropout:
-        wrong = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
+        found = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
     delays = Delays(round(sensors.latency / period), round(config.vehicle.latency / period))
-    return wrong, delays if any(delays) else None
+    return found, delays if any(delays) else None
 
 
 @leaf
-def degrade(wrong, reach, car, ranges):
+def degrade(imperfections, reach, car, ranges):
     """Add noise to ranges (m) within the sensor's reach, and drop some of them."""
-    if wrong is None:
+    if imperfections is None:
         return
     place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre
     key = mix(mix(place) + U(I(car[STEPS])))
     for r in range(ranges.shape[0]):
         bits = mix(key + U(r + 1) * GOLDEN)
-        if bits >> U(40) < wrong.dropout:
+        if bits >> U(40) < imperfections.dropout:
             ranges[r] = reach
             continue
         # Nearly normal: the sum of four uniform numbers (Irwin-Hall).
         total = (bits & U(1023)) + (bits >> U(10) & U(1023)) + (bits >> U(20) & U(1023)) + (bits >> U(30) & U(1023))
         normal = (F(total) - F(2046.0)) * _SIDES
-        noisy = ranges[r] + (wrong.noise + wrong.noise_share * ranges[r]) * normal
+        noisy = ranges[r] + (imperfections.noise + imperfections.noise_share * ranges[r]) * normal
         ranges[r] = min(max(noisy, ZERO), reach)
 
 
