@@ -81,8 +81,8 @@ class VehicleConfig:
     # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking it is 9.4:
     # less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
     lateral_grip: float = 4.9
-    # kinematic, or single_track with what follows: linear tyres, without the limit of `lateral_grip`. The numbers are
-    # those of CommonRoad's vehicle 2, a BMW 320i (Althoff et al. 2017).
+    # kinematic or single_track. The numbers that follow are for the latter, whose tyres are linear and do not know
+    # `lateral_grip`; they are those of CommonRoad's vehicle 2, a BMW 320i (Althoff et al. 2017).
     model: str = "kinematic"
     mass: float = 1093.3  # kg
     yaw_inertia: float = 1791.6  # kg m2
@@ -187,7 +187,7 @@ class SimConfig:
     sensors: SensorConfig = field(default_factory=SensorConfig)
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
     traffic: TrafficConfig = field(default_factory=TrafficConfig)
-    # Numbers of the vehicle that are drawn for each episode, uniformly: name, least and most.
+    # Name, least and greatest value of each number of the vehicle that is drawn for each episode, uniformly.
     randomise: tuple[tuple[str, float, float], ...] = ()
 
     def drawn(self, start: np.ndarray) -> SimConfig:

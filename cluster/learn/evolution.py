@@ -54,7 +54,7 @@ class Evolution(Learning):
 
     @property
     def comfort(self) -> bool:
-        return bool(self.settings.fitness)  # which may need them
+        return bool(self.settings.fitness)  # a fitness of the user's own may need them
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes the worst."""
@@ -69,7 +69,8 @@ class Evolution(Learning):
 
     def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
         super()._judge(candidate, results, step)
-        self.solved = self.solved and not self.settings.fitness  # which may still rise
+        # With a fitness of the user's own, a champion that always succeeds may still become better.
+        self.solved = self.solved and not self.settings.fitness
 
     def step(self) -> Progress:
         """Evolve one generation."""

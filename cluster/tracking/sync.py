@@ -58,7 +58,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         import mlflow.store.tracking.sqlalchemy_store  # noqa: F401
     from mlflow.utils.requirements_utils import warn_dependency_requirement_mismatches
 
-    # MLflow lists all packages that are installed, as it will for the model: 0.3 s that would fall after the run.
+    # For a model, MLflow lists the installed packages once, in 0.3 s. Here that is done while the run goes on.
     warn_dependency_requirement_mismatches(["mlflow"])
     folder, read = Path(order["folder"]), pkgutil.resolve_name(order["read"])
     run = LoggedRun(folder, order["uri"], order["experiment"])

@@ -9,7 +9,9 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-GRACE_S = 60  # from SIGTERM to SIGKILL: a run saves and ends in half of that, and Ray may never see the former
+# Seconds from SIGTERM to SIGKILL. A run saves and ends in half of that. Ray's head never ends if it waits, in vain, for
+# its own processes.
+GRACE_S = 60
 # This shell becomes the command. The one that it starts ends that, and all in its session, when a pipe ends which only
 # we hold open: if we close it, and also if we are killed.
 _SHELL = """exec 3<&0; grace_s=$1; shift

@@ -35,7 +35,7 @@ from gridsim.sensing.imperfections import imperfections_of
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
-OWN = "fitness"  # stands for a fitness of the user's own
+OWN = "fitness"  # in names of markers and on command lines: the run has a fitness of the user's own
 PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
 
 

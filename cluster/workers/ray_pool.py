@@ -1,7 +1,7 @@
 """A pool of Ray actors, on a Ray of our own or on an existing cluster.
 
-Dead actors are replaced here and not by Ray's `max_restarts`: what they held has to be sent again either way. Ray may
-never report one that is stopped or whose host is cut off, so that one which is silent for long is replaced as well.
+Dead actors are replaced here, not by Ray's `max_restarts`, since what they held is sent again either way. So are those
+that are silent for long: of one that is stopped or cut off, Ray may never say anything.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class _Worker:
 
 
 class RayPool(WorkerPool):
-    """Workers as Ray actors of one CPU each. One pool at a time in a process.
+    """Workers as Ray actors of one CPU each. One Ray at a time in a process.
 
     Args: those of `open_pool`, and `worker_factory`, which makes what evaluates; it must be importable in the workers.
     """
@@ -180,9 +180,8 @@ class RayPool(WorkerPool):
         if at_it and at_it.call is self._call:
             at_it.kills += 1
             if at_it.kills == MAX_KILLS:
-                raise PoolError(
-                    f"{MAX_KILLS} workers died over {at_it.call.identify(at_it.chunk)}; the last time {why}"
-                )
+                what = at_it.call.identify(at_it.chunk)
+                raise PoolError(f"{MAX_KILLS} workers died over {what}; the last time {why}")
         if self._deaths > max(MAX_DEATHS, MAX_KILLS * self.workers):
             raise PoolError(f"workers keep dying ({self._deaths} in a row); the last time {why}")
 

@@ -89,8 +89,7 @@ class Session:
         """Start a Ray of our own, wait until it is up, and return its address. Raises PoolError."""
         base, cure = os.environ.get("RAY_TMPDIR") or "/tmp", "set RAY_TMPDIR to a folder with room and a short path"
         try:
-            # Ray's own choice, /tmp/ray, is open to all users of a machine.
-            self._folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))
+            self._folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))  # /tmp/ray would be open to all
         except OSError as error:
             raise PoolError(f"Ray cannot be started: {base}: {error.strerror}; {cure}") from None
         with socket.create_server(("127.0.0.1", 0)) as free:

@@ -1,6 +1,6 @@
 """The dynamic single-track model: linear tyres, and load that shifts between the axles as the car brakes.
 
-Althoff, Koschi, Manzinger 2017, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", eq. of `ST`. With
+Althoff, Koschi, Manzinger 2017, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", model ST. With
 speed v, yaw rate w, slip angle b, steering angle d and acceleration a, the yaw rate and the slip angle follow
 
     w' = mu m / (I L) (-(lf^2 F + lr^2 R) w / v + (lr R - lf F) b + lf F d)
@@ -22,7 +22,7 @@ from gridsim.jit import HALF, ONE, ZERO, F, I, leaf
 
 GRAVITY = F(9.81)  # m/s2
 KINEMATIC_BELOW = F(1.0)  # m/s
-SHORT = F(0.0125)  # s, of integration at most: a hundredth of the time in which a car's yaw settles at 30 m/s
+LONGEST_STEP = F(0.0125)  # s that one step of the integration takes, at most
 
 
 class SingleTrack(NamedTuple):
@@ -64,7 +64,7 @@ def advance_single_track(track, x, y, cosine, sine, speed, yaw_rate, slip, steer
     behind = track.friction * track.stiffness_rear * (GRAVITY * front + acceleration * track.height)
     turning, moment = rear * behind - front * ahead, track.yaw_share / base
     damping = front * front * ahead + rear * rear * behind
-    parts = I(1) + I(dt / SHORT)
+    parts = I(1) + I(dt / LONGEST_STEP)
     h = dt / F(parts)
     length = ZERO
     for _ in range(parts):
