@@ -18,7 +18,7 @@ from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
+from gridsim.maps.scenarios import REGISTRY, build, check_name, default_traffic, is_map_file, speed_interval
 from gridsim.step import parameters
 from gridsim.traffic.world import check_traffic
 
@@ -28,6 +28,8 @@ LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
+
+ROADS = f"{', '.join(REGISTRY)}, or a map file (docs/maps.md)."
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -41,8 +43,7 @@ class RunSettings(ABC):
     step_name: ClassVar[str]  # what a step of learning is called
     verb: ClassVar[str]  # what is done to a network
 
-    scenario: str = "seamless"
-    """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
+    scenario: Annotated[str, tyro.conf.arg(help=f"Road to learn on: {ROADS}")] = "seamless"
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
     sim: str = "default"

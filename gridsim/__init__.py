@@ -8,13 +8,16 @@ the simulator must not import what trains in it.
 """
 
 from importlib import import_module as _import_module
+from pathlib import Path as _Path
+from pkgutil import iter_modules as _iter_modules
 from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
 from gridsim.config import SimConfig as SimConfig
 
-ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in ("highway", "curved", "seamless", "roundabout", "city")}
+_GENERATORS = str(_Path(__file__).parent / "maps" / "generators")
+ENVIRONMENTS = {f"GridSim/{file.name.title()}-v0": file.name for file in _iter_modules([_GENERATORS])}
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"
