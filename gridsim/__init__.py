@@ -4,7 +4,7 @@ Importing it registers the Gymnasium environments. That takes milliseconds, beca
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 
 `gridsim.evolve` and the other names of `cluster.api` are loaded from there on first use: users look for them here, but
-the simulator must not import what trains in it.
+the simulator must not import what trains in it. They need the extra `evolve` (`gridsim.packages`).
 """
 
 from importlib import import_module as _import_module
@@ -47,4 +47,5 @@ def __getattr__(name: str) -> _Any:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_API]
+    packages = _import_module("gridsim.packages")
+    return [*globals(), *(() if packages.missing("evolve") else _API)]
