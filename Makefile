@@ -65,7 +65,7 @@ format: $(DEV) ## Rewrite the code in the project's format
 	$(BIN)/ruff format .
 
 # The stamp comes last, so that an install cut short is done again.
-$(STAMP): EXTRA :=
+$(STAMP): EXTRA := [evolve]
 $(DEV): EXTRA := [dev]
 $(STAMP) $(DEV): pyproject.toml
 	@if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \

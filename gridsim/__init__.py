@@ -4,7 +4,8 @@ Importing it registers the Gymnasium environments. That takes milliseconds, beca
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 
 `gridsim.SimConfig`, and `gridsim.evolve` and the other names of `cluster.api`, are loaded on first use: users look for
-them here, but the simulator must not import what trains in it.
+them here, but the simulator must not import what trains in it. Those of `cluster.api` need the extra `evolve`
+(`gridsim.packages`).
 """
 
 from importlib import import_module as _import_module
@@ -50,4 +51,5 @@ def __getattr__(name: str) -> _Any:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), "SimConfig", *_API]
+    packages = _import_module("gridsim.packages")
+    return [*globals(), "SimConfig", *(() if packages.missing("evolve") else _API)]

@@ -1,4 +1,4 @@
-"""GridSim's other packages, whose names are plain words: a user's file of such a name may hide them."""
+"""What may be missing beside the simulator: extras, and GridSim's other packages, which a user's file may hide."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ from pathlib import Path
 
 from gridsim.errors import GridSimError
 
+#: The name of what pip installs; on PyPI, `gridsim` is another program.
+DISTRIBUTION = "gridsim-driving"
+#: What is imported of each extra of pyproject.toml.
+_EXTRAS = {
+    "evolve": "docstring_parser imageio_ffmpeg matplotlib mlflow onnx onnxruntime pygame ray rich torch tyro",
+    "roads": "sumo",
+    "view": "pygame",
+}
 #: A file in each package, by which it is told from a user's file or folder of the same name.
 _FILES = {"cluster": "api.py", "evolution": "episodes/rollout.py"}
 
@@ -27,7 +35,20 @@ def package_folder(name: str) -> Path:
     raise GridSimError(f"{hiding} hides GridSim's package {name}: rename it, or move it to another folder")
 
 
+def missing(extra: str) -> list[str]:
+    """What of an extra is not installed."""
+    found = {module: find_spec(module) for module in _EXTRAS[extra].split()}
+    return [module for module, spec in found.items() if not (spec and spec.origin)]  # without one it is but a folder
+
+
+def check_extra(extra: str) -> None:
+    """Raise GridSimError if an extra is not installed."""
+    if names := missing(extra):
+        raise GridSimError(f'pip install "{DISTRIBUTION}[{extra}]" installs what is missing: {", ".join(names)}')
+
+
 def check_packages() -> None:
-    """Raise GridSimError if a user's file or folder hides one of GridSim's packages."""
+    """Raise GridSimError if the commands and `gridsim.evolve` lack the extra, or a user's file hides a package."""
     for name in _FILES:
         package_folder(name)
+    check_extra("evolve")

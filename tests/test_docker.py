@@ -6,14 +6,13 @@ import os
 import re
 import shlex
 import subprocess
-import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from commands import BIN, end, finish, wait_until
+from commands import BIN, PROJECT, end, finish, requirements, wait_until
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
@@ -25,7 +24,6 @@ from cluster.workers.kernels import everything_by_default
 from gridsim.maps.scenarios import REGISTRY
 
 ROOT = Path(__file__).parents[1]
-PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 DOCKERFILE = (ROOT / "docker/Dockerfile").read_text(encoding="utf-8")
 TOKEN = "0123456789abcdef" * 4
 
@@ -65,7 +63,7 @@ def test_what_is_copied_is_there_and_is_what_pip_needs() -> None:
     files = [path for source in sources for path in [ROOT / source, *(ROOT / source).rglob("*.py")] if path.is_file()]
     assert [path for path in files if ignored(str(path.relative_to(ROOT)))] == []
     project = PROJECT["project"]
-    packages = [name.removesuffix("*") for name in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]]
+    packages = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
     assert {"pyproject.toml", project["readme"], *project["license-files"], *packages} <= set(sources)
     assert all(map(ignored, ("runs/a/checkpoint.npz", ".git/config", "cluster/__pycache__/cli.cpython-311.pyc")))
 
@@ -78,9 +76,8 @@ def test_python_and_every_package_are_pinned_to_a_version_that_the_project_takes
     found = [re.fullmatch(r"([A-Za-z0-9._-]+)==([A-Za-z0-9.+]+)", line) for line in lines if line[0] not in "#-"]
     assert all(found), "every package with one version"
     pinned = {canonicalize_name(match[1]): match[2] for match in found if match}
-    for line in [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]:
-        requirement = Requirement(line)
-        assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, line
+    for requirement in [*requirements("evolve"), *map(Requirement, PROJECT["build-system"]["requires"])]:
+        assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, requirement
 
 
 def test_it_runs_as_a_user_whose_caches_and_volumes_are_its_own() -> None:

@@ -4,18 +4,18 @@ import ast
 import re
 import subprocess
 import sys
-import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from importlib.metadata import packages_distributions
 from pathlib import Path
-from typing import Any
 
 import pytest
-from commands import finish
+from commands import PROJECT, finish, requirements
+from packaging.utils import canonicalize_name
 
-PROJECT: dict[str, Any] = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+from gridsim import packages
+
 # Imports run downwards only: cluster -> evolution -> gridsim.
 RANK = {"gridsim": 0, "evolution": 1, "cluster": 2}
 # The only files that may import these, anywhere in them.
@@ -24,8 +24,9 @@ BEHIND = {
     "mlflow": {"cluster/tracking/logged.py", "cluster/tracking/database.py", "cluster/tracking/sync.py"},
     "pygame": {"gridsim/view/render.py", "gridsim/view/drive.py"},
 }
+EXTRAS = {extra: set(modules.split()) for extra, modules in packages._EXTRAS.items()}
 # What a package knows nothing of.
-NOT_IN = {"gridsim": {"ray", "mlflow", "torch", "tyro", "rich"}, "evolution": {"ray", "mlflow", "tyro", "rich"}}
+NOT_IN = {"gridsim": EXTRAS["evolve"] - EXTRAS["view"], "evolution": EXTRAS["evolve"] - {"torch", "onnx"}}
 MOST_MODULES, MOST_LINES = 14, 500  # of a folder, and of a file
 
 
@@ -77,20 +78,30 @@ def test_none_import_each_other_in_a_circle(root: Path, parts: int) -> None:
     TopologicalSorter(found).prepare()  # raises CycleError, which names them
 
 
-def test_every_package_that_is_imported_is_declared(root: Path) -> None:
+def test_what_is_imported_is_installed_or_of_an_extra_that_is_checked(root: Path) -> None:
     """Stable-Baselines3, which `gridsim.envs.sb3` adapts to, is the user's own."""
-    declared = {re.split(r"[^\w.-]", line)[0].replace("_", "-") for line in PROJECT["project"]["dependencies"]}
+
+    def asked(extra: str = "") -> set[str]:
+        return {canonicalize_name(item.name) for item in requirements(extra)}
+
     sources = [f.read_text(encoding="utf-8") for package in RANK for f in (root / package).rglob("*.py")]
     tops = {name.partition(".")[0] for source in sources for name, _ in imports(source)} - sys.stdlib_module_names
     projects = packages_distributions()
-    found = {top: {name.replace("_", "-").lower() for name in projects.get(top, ())} for top in tops - set(RANK)}
-    assert {top for top, names in found.items() if not names & declared} == {"stable_baselines3"}
+    tops -= {*RANK, "stable_baselines3"}
+
+    def projects_of(modules: set[str]) -> set[str]:
+        return {canonicalize_name(name) for module in modules for name in projects[module]}
+
+    assert {top for top in tops if not projects_of({top}) & asked()} <= set.union(*EXTRAS.values())
+    for extra, modules in EXTRAS.items():
+        assert all(projects_of({module}) & asked(extra) for module in modules)
+        assert asked(extra) - asked() <= projects_of(modules)
 
 
 @pytest.mark.parametrize(
     ("module", "banned"),
     [
-        ("gridsim", {"numba", "torch"}),
+        ("gridsim", {"numba", "scipy", "PIL", *set.union(*EXTRAS.values())}),
         ("evolution.search.recombination", {"evolution.networks", "evolution.episodes", "gridsim.car", "gridsim.maps"}),
         ("evolution.search.two_parents", {"evolution.networks", "evolution.episodes", "gridsim.car", "gridsim.maps"}),
         ("cluster.workers.worker", {"ray", "torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}),
@@ -107,15 +118,12 @@ def test_a_fresh_process_loads_no_more_than_it_needs(root: Path, module: str, ba
 # --- What is installed -----------------------------------------------------------------------------------------------
 
 
-def test_every_folder_is_a_package_and_typed_and_files_that_are_no_python_are_packaged(root: Path) -> None:
-    tops = {pattern.removesuffix("*") for pattern in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]}
-    assert tops == {"cluster", "evolution", "gridsim"}
+def test_every_folder_is_a_package_and_typed(root: Path) -> None:
+    tops = set(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
+    assert tops == set(RANK)
     folders = {path.parent for top in tops for path in (root / top).rglob("*.py")}
     assert [folder for folder in sorted(folders) if not (folder / "__init__.py").is_file()] == []
     assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
-    patterns = PROJECT["tool"]["setuptools"]["package-data"]["cluster"]
-    packaged = {path.name for pattern in patterns for path in (root / "cluster").glob(pattern)}
-    assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml", "drive.html"}
 
 
 def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path) -> None:
@@ -127,7 +135,7 @@ def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path
         return re.findall(r'--editable "(.*)"', said(target))
 
     for target in ("install", "evolve", "dqn", "compare", "ui", "bench", "pictures"):
-        assert installs(target) == ["."]
+        assert installs(target) == [".[evolve]"]
     for target in ("develop", "test", "lint", "format"):
         assert installs(target) == [".[dev]"]
     assert f"touch {tmp_path}/.installed {tmp_path}/.installed-dev" in said("test")  # it has what a user needs, too

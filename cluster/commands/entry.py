@@ -26,7 +26,9 @@ def _enter(module: str, name: str) -> None:
     if "--version" in sys.argv[1:]:
         from importlib.metadata import version  # which takes longer than all else until signals are handled
 
-        print(f"gridsim {version('gridsim')}")
+        from gridsim.packages import DISTRIBUTION
+
+        print(f"gridsim {version(DISTRIBUTION)}")
         return
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # else the shell or nohup had it ignored
@@ -41,7 +43,7 @@ def _enter(module: str, name: str) -> None:
     try:
         check_packages()
         getattr(import_module(f"cluster.commands.{module}"), name)()
-    except GridSimError as error:  # a user's file hides a package, or no folder can keep compiled kernels
+    except GridSimError as error:  # a package is hidden, an extra is missing, or no folder can keep compiled kernels
         print(f"{prog}: error: {error}", file=sys.stderr)
         sys.exit(2)
     except SystemExit as ended:

@@ -27,6 +27,7 @@ from evolution.networks.policy import Observation
 from gridsim.config import names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file, label
+from gridsim.packages import DISTRIBUTION
 
 COMPARISON = "comparison.json"
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
@@ -156,7 +157,7 @@ def limits(budget: str) -> tuple[int, float]:
 
 def write_plan(folder: Path, plan: Plan) -> None:
     """Write comparison.json. Raises CheckpointError."""
-    content = {"command": "gridsim-compare", "gridsim": version("gridsim"), "plan": dataclasses.asdict(plan)}
+    content = {"command": "gridsim-compare", "gridsim": version(DISTRIBUTION), "plan": dataclasses.asdict(plan)}
     checkpoint.write_atomic(folder / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
 
 

@@ -27,6 +27,7 @@ from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import is_map_file, label
+from gridsim.packages import DISTRIBUTION
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
 FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, ELITES, HISTORY, ONNX, PAGE, STEPS, SUMMARY, TRAJECTORY)
@@ -59,7 +60,7 @@ class RunFolder:
         return {
             "format": CONFIG_FORMAT,
             "command": self.settings.command,
-            "gridsim": version("gridsim"),
+            "gridsim": version(DISTRIBUTION),
             "settings": dataclasses.asdict(self.settings),
             "curriculum": dataclasses.asdict(self.settings.curriculum()),
             "simulator": dataclasses.asdict(self.settings.simulator()),

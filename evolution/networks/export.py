@@ -26,7 +26,7 @@ from evolution.networks.policy import (
     PolicySpec,
 )
 from gridsim.config import SimConfig
-from gridsim.errors import GridSimError
+from gridsim.packages import check_extra
 from gridsim.sensing.grid import CELLS, FREE
 
 OPSET, IR_VERSION = 17, 8
@@ -46,12 +46,11 @@ def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
     """A genome float32 [genes] as an ONNX file.
 
     The same genome always gives the same bytes. `config` gives the scales of the environment's observations.
-    Raises: GridSimError if onnx is not installed, ValueError if the genome does not fit the policy.
+    Raises: GridSimError without onnx, ValueError if the genome does not fit the policy.
     """
-    try:
-        from onnx import TensorProto, helper, numpy_helper  # takes 0.2 s
-    except ModuleNotFoundError as error:
-        raise GridSimError("an ONNX file needs the package onnx: pip install onnx") from error
+    check_extra("evolve")
+    from onnx import TensorProto, helper, numpy_helper  # takes 0.2 s
+
     if genome.shape != (spec.size,) or genome.dtype != np.float32:
         raise ValueError(f"a genome of {spec} is float32 [{spec.size}], not {genome.dtype} {genome.shape}")
     graph = _Graph()

@@ -70,6 +70,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         "render_fps": 1.0 / SimConfig().episode.control_period,  # a picture per control step: real time
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
+    _window: Window | None = None  # of the class: Gymnasium before 1.3 also closes what a wrong argument left half made
 
     def __init__(
         self,
@@ -129,7 +130,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
         self.render_mode = render_mode
         self._views: dict[Map, Renderer] = {}
-        self._window: Window | None = None
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
         self._observer = Observer(self.simulator, observation, frames, motion, steering)
         self.single_observation_space = self._observer.space

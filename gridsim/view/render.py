@@ -21,6 +21,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import freeze
 from gridsim.maps.map import Map
+from gridsim.packages import check_extra
 from gridsim.state import COS, SIN, STEERING, X, Y
 from gridsim.view import paint
 from gridsim.view.display import has_display
@@ -234,7 +235,8 @@ class Window:
     _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
-        """Open it. Raises: NoDisplayError."""
+        """Open it. Raises: NoDisplayError, and GridSimError without pygame."""
+        check_extra("view")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
 

@@ -8,7 +8,7 @@ import shutil
 import sys
 import tomllib
 from collections.abc import Iterator
-from importlib.metadata import distribution, requires
+from importlib.metadata import distribution
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,8 @@ import hosts
 import jsonschema  # type: ignore[import-untyped]
 import pytest
 import yaml
-from commands import BIN, all_in_mlflow, ray_workers, summary, wait_until
+from commands import BIN, all_in_mlflow, ray_workers, requirements, summary, wait_until
 from hosts import HOME, Host
-from packaging.requirements import Requirement
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
@@ -70,7 +69,7 @@ def test_file_fits_rays_schema_and_gives_each_machine_the_project_and_the_token(
 
 @pytest.mark.parametrize("name", LAUNCHED)
 def test_versions_are_those_that_the_project_asks_for(root: Path, name: str) -> None:
-    wanted = {item.name: item for item in map(Requirement, requires("gridsim") or ())}
+    wanted = {item.name: item for item in requirements("evolve")}
     versions = pinned(read(root, name))
     assert set(versions) >= {"numpy", "numba", "scipy", "torch"}
     assert [package for package, version in versions.items() if not wanted[package].specifier.contains(version)] == []

@@ -107,7 +107,7 @@ def test_each_command_tells_its_version(prog, monkeypatch, capsys):
     (script,) = entry_points(group="console_scripts", name=prog)
     monkeypatch.setattr(sys, "argv", [prog, "--version"])
     script.load()()
-    assert capsys.readouterr() == (f"gridsim {version('gridsim')}\n", "")
+    assert capsys.readouterr() == (f"gridsim {version('gridsim-driving')}\n", "")
 
 
 def test_more_workers_than_cores_can_use_are_told_of(monkeypatch, capsys):

@@ -8,16 +8,26 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
+from importlib.metadata import requires
 from pathlib import Path
 from subprocess import PIPE
 
 import psutil  # type: ignore[import-untyped]
 import pytest
+from packaging.requirements import Requirement
 
 BIN = Path(sys.executable).parent
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
 # Of a user who has not activated .venv, so that commands print their whole path.
 PATH = os.pathsep.join(name for name in os.get_exec_path() if Path(name).resolve() != BIN.resolve())
+
+
+def requirements(extra=""):
+    """What the project and one of its extras ask for."""
+    asked = map(Requirement, requires(PROJECT["project"]["name"]) or ())
+    return [item for item in asked if item.marker is None or item.marker.evaluate({"extra": extra})]
 
 
 def start(program, *flags, cwd, **env):
