@@ -148,27 +148,27 @@ def _pairs(starts, ends, boxes, group, width, height):
 
 
 @njit
-def _near(one, other, width, height, gap):
-    """Whether a point of polyline `one` [n, 2] is within `gap` m of polyline `other` [m, 2], on the torus."""
+def _near(one, other, width, height):
+    """Whether a point of polyline `one` [n, 2] is within CROSSING_GAP of polyline `other` [m, 2], on the torus."""
     for i in range(len(one)):
         for j in range(len(other) - 1):
             ax, ay = other[j, 0] - one[i, 0], other[j, 1] - one[i, 1]
             ax, ay = ax - width * round(ax / width), ay - height * round(ay / height)
             dx, dy = other[j + 1, 0] - other[j, 0], other[j + 1, 1] - other[j, 1]
             t = min(max(-(ax * dx + ay * dy) / (dx * dx + dy * dy), 0.0), 1.0)
-            if (ax + t * dx) ** 2 + (ay + t * dy) ** 2 < gap**2:
+            if (ax + t * dx) ** 2 + (ay + t * dy) ** 2 < CROSSING_GAP**2:
                 return True
     return False
 
 
 @njit
-def find_crossings(points, offsets, candidates, width, height, gap):
-    """Which of the candidates, pairs of lanes, come closer than `gap` m: bool [lanes, lanes], symmetric."""
+def _crossings(points, offsets, candidates, width, height):
+    """Which of the candidates, pairs of lanes, may collide in a junction: bool [lanes, lanes], symmetric."""
     cross = np.zeros_like(candidates)
     for i in range(len(cross)):
         one = points[offsets[i] : offsets[i + 1]]
         for j in range(i + 1, len(cross)):
-            if candidates[i, j] and _near(one, points[offsets[j] : offsets[j + 1]], width, height, gap):
+            if candidates[i, j] and _near(one, points[offsets[j] : offsets[j + 1]], width, height):
                 cross[i, j] = cross[j, i] = True
     return cross
 
@@ -196,7 +196,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     successors = np.full((n, FORKS), -1, dtype=np.int32)
     one, other = np.nonzero(follows)
     successors[one, np.arange(len(one)) - np.searchsorted(one, one)] = other
-    cross = find_crossings(points, offsets, candidates, *sides, CROSSING_GAP)
+    cross = _crossings(points, offsets, candidates, *sides)
     arrays = {
         "points": points,
         "speeds": np.zeros(len(points), dtype=np.float32),

@@ -232,7 +232,8 @@ def change_lanes(network, drivers, world, i, ego):
         return
     car[s.LANE_TIMER] = drivers.lane_change_steps - ONE
     lane = I(car[s.LANE])
-    if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0:
+    near = is_junction(network, I(car[s.NEXT])) and lane_length(network, lane) - car[s.ALONG] < config.KEEP_LANE
+    if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0 and not near:
         _choose_neighbour(network, drivers, world, i, ego)
 
 
@@ -345,7 +346,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         apart = _lanes_apart(network, lane, along, best)
         car[s.SHIFT] = -apart if best == network.left[lane] else apart
         car[s.ALONG] = along / network.steps[lane] * network.steps[best]
-        car[s.LANE] = F(best)
+        car[s.LANE], car[s.PERMIT] = F(best), -ONE
         car[s.NEXT] = F(choose_lane(network, best, car))
         car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
         # While it moves over, it must not touch the car ahead in its old lane.

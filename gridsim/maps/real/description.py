@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+RETURN = 4.0  # m that a line may go back where two lanes meet, because a file's nodes are closer than its junctions
+RETURN_COSINE = -0.2  # of the angle at such a point
+
 
 @dataclass
 class Lane:
@@ -99,10 +102,26 @@ def part_of(lane: Lane, first: float, last: float) -> Lane:
 def joined(one: Lane, other: Lane) -> Lane:
     """Two lanes, of which one follows the other, as one; with the successors of the second."""
     left, right = (np.concatenate([a, b[1:]]) for a, b in ((one.left, other.left), (one.right, other.right)))
+    kept = _without_returns((left + right)[:, :2] / 2)
     speeds = [lane.speed for lane in (one, other) if not math.isnan(lane.speed)]
     junction = one.junction if one.length > other.length else other.junction
     speed = (one if one.length > other.length else other).speed if speeds else math.nan
-    return replace(one, left=left, right=right, speed=speed, successors=list(other.successors), junction=junction)
+    successors = list(other.successors)
+    return replace(one, left=left[kept], right=right[kept], speed=speed, successors=successors, junction=junction)
+
+
+def _without_returns(line: np.ndarray) -> list[int]:
+    """Which points of a polyline [n, 2] to keep, so that it does not go back a little and then forth again."""
+    kept: list[int] = []
+    for k in range(len(line)):
+        kept.append(k)
+        while len(kept) > 2:
+            before, after = line[kept[-2]] - line[kept[-3]], line[kept[-1]] - line[kept[-2]]
+            lengths = np.hypot(*before), np.hypot(*after)
+            if min(lengths) > RETURN or before @ after > RETURN_COSINE * lengths[0] * lengths[1]:
+                break
+            del kept[-2]
+    return kept
 
 
 def groups_of(lanes: dict[str, Lane]) -> list[list[str]]:

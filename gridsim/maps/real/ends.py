@@ -17,6 +17,7 @@ PARTNER = 45.0  # m between the end of a road and the beginning of the opposite 
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
 SPARE = 15.0  # m that are left of it, at least
 ROOM = 4.2  # m from a loop to lanes of other roads, at least
+WIDEST = 25.0  # m, of a road's end
 LONGEST = 500.0  # m, of a way round the world
 
 Pose = tuple[float, float, float]
@@ -143,6 +144,11 @@ def _add_loop(road: RealRoad, ground: _Ground, one: list[str], other: list[str])
     return False
 
 
+def _beside(one: Lane, other: Lane) -> bool:
+    """Whether two lanes end at the same end of a road."""
+    return math.dist(one.centre[-1, :2], other.centre[-1, :2]) < WIDEST
+
+
 def _connections(
     lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, shift: np.ndarray
 ) -> list[tuple[Lane, str]]:
@@ -188,14 +194,15 @@ def join_round_the_world(road: RealRoad, sides: np.ndarray) -> None:
                 moved = np.array(shift) * sides
                 curve = shortest_curve(start, (x + moved[0], y + moved[1], angle), ROUND_RADIUS)
                 if (length := sum(piece for piece, _ in curve.pieces)) < LONGEST:
-                    found.append((length, i, j, moved))
+                    found.append((-min(len(one), len(other)), length, i, j, moved))
     ground = _Ground(road.lanes, sides)
     used_out, used_back = set(), set()
-    for length, i, j, moved in sorted(found, key=lambda way: way[:3]):
+    for _, length, i, j, moved in sorted(found, key=lambda way: way[:4]):
         if i in used_out or j in used_back:
             continue
         new = _connections(road.lanes, out[i], back[j], ROUND_RADIUS, moved)
-        if all(ground.is_free(lane.centre[:, :2], {*out[i], *back[j]}) for lane, _ in new):
+        own = {*back[j], *(key for group in out for key in group if _beside(road.lanes[key], road.lanes[out[i][0]]))}
+        if all(ground.is_free(lane.centre[:, :2], own) for lane, _ in new):
             _add(road, new)
             ground.add([lane for lane, _ in new])
             used_out.add(i)

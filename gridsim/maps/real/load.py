@@ -81,9 +81,9 @@ class Prepared:
         with np.load(path, allow_pickle=False) as arrays:
             name, *notes = (str(line) for line in arrays["text"])
             nodes = arrays["field"].astype(np.float32) / F(FIELD_STEPS) + F(FIELD_FLOOR)
-            lanes = {key: freeze(arrays[f"lanes_{key}"]) for key in Network._fields}
-            width, height, hand = (np.float32(lanes.pop(key)) for key in ("width", "height", "hand"))
-            network = Network(**lanes, width=width, height=height, hand=hand)
+            *columns, width, height, hand = (arrays[f"lanes_{key}"] for key in Network._fields)
+            scalars = (np.float32(value.item()) for value in (width, height, hand))
+            network = Network._make([*map(freeze, columns), *scalars])
             return cls(name, notes, arrays["origin"], nodes, network, arrays["limits"])
 
 
@@ -109,17 +109,18 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     select.on_one_level(road)
     ends.add_turning_loops(road)
     road.lanes = select.keep(road.lanes, select.largest_connected(road.lanes))
-    whole = road.length
+    size = None
     joined = select.largest_joined(road.lanes)
-    if sum(lane.length for lane in joined.values()) < whole / 2:
-        ends.join_round_the_world(road, sides_of(road.lanes))
+    if sum(lane.length for lane in joined.values()) < road.length / 2:
+        size = sides_of(road.lanes)
+        ends.join_round_the_world(road, size)
         joined = select.largest_joined(road.lanes)
     if not joined:
         raise GridSimError("no road for cars on which one can drive on; is it a map of roads?")
     road.lanes = joined
     if (cut := read - road.length) > 1.0:
         road.notes.append(f"{cut / 1000:.1f} of {read / 1000:.1f} km of lanes lead nowhere, or do not join the rest")
-    size = sides_of(road.lanes)
+    size = sides_of(road.lanes) if size is None else size
     points = np.concatenate([lane.centre[:, :2] for lane in road.lanes.values()])
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.round((low + high) / 2 - size / 2, 2)
@@ -173,7 +174,7 @@ def load_road(name: str, config: SimConfig) -> Map:
     """The map of a file of real roads; the same object as long as the file does not change. Raises: GridSimError."""
     if config.unit < 1.0:
         raise GridSimError(f"{name}: real roads are for cars of 2.9 m or more, not of {config.vehicle.length:g} m")
-    return _load(os.path.abspath(name), file_digest(name), config)
+    return load(os.path.abspath(name), file_digest(name), config)
 
 
 def file_digest(name: str) -> str:
@@ -182,15 +183,26 @@ def file_digest(name: str) -> str:
 
 
 @lru_cache(maxsize=4)
-def _load(name: str, digest: str, config: SimConfig) -> Map:
-    return map_of(name, prepared(name, digest, config.vehicle.width + config.traffic.beside), config)
+def load(name: str, digest: str, config: SimConfig) -> Map:
+    """The map of a file with this digest."""
+    return map_of(name, prepared(name, digest, gap_of(config)), config)
+
+
+def gap_of(config: SimConfig) -> float:
+    """The distance (m) of lanes' middle lines below which their cars may touch."""
+    return config.vehicle.width + config.traffic.beside
+
+
+def cached(name: str, digest: str, gap: float) -> Path:
+    """Where what is made of a file is kept."""
+    key = hashlib.sha256(f"{digest} {split_crop(name)[1]} {gap}".encode()).hexdigest()[:32]
+    return CACHE_FOLDER / f"road-{key}.npz"
 
 
 def prepared(name: str, digest: str, gap: float) -> Prepared:
     """What `prepare` makes of a file, from the cache if it is there."""
     path, crop = split_crop(name)
-    key = hashlib.sha256(f"{digest} {crop} {gap}".encode()).hexdigest()[:32]
-    kept = CACHE_FOLDER / f"road-{key}.npz"
+    kept = cached(name, digest, gap)
     try:
         return Prepared.load(kept)
     except (OSError, ValueError, LookupError, zipfile.BadZipFile):

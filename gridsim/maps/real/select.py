@@ -131,13 +131,30 @@ def largest_joined(lanes: dict[str, Lane]) -> dict[str, Lane]:
                 return lanes
 
 
+def on_rings(onward: dict[str, list[str]]) -> set[str]:
+    """Which nodes of a graph, given by the nodes after each, lie on one closed way and no other."""
+    keys = list(onward)
+    labels = _components(keys, [(key, other) for key in keys for other in onward[key]], "strong")
+    label = dict(zip(keys, labels, strict=True))
+    inside = {key: sum(label[other] == label[key] for other in onward[key]) for key in keys}
+    branched = {label[key] for key in keys if inside[key] != 1}
+    return {key for key in keys if label[key] not in branched}
+
+
+def _components(keys: list[str], pairs: list[tuple[str, str]], connection: str) -> np.ndarray:
+    """The number of the component of a graph in which each node is."""
+    index = {key: k for k, key in enumerate(keys)}
+    edges = np.array([(index[a], index[b]) for a, b in pairs if b in index], dtype=np.intp).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(keys), len(keys)))
+    return connected_components(graph, directed=True, connection=connection)[1]
+
+
 def _largest(lanes: dict[str, Lane], connection: str) -> set[str]:
     """The largest component (m) of the graph of successors and changes of lanes."""
     keys = list(lanes)
-    index = {key: k for k, key in enumerate(keys)}
+    if not keys:
+        return set()
     onward = [(key, s) for key, lane in lanes.items() for s in (*lane.successors, lane.left_lane, lane.right_lane)]
-    edges = np.array([(index[a], index[b]) for a, b in onward if b in index], dtype=np.intp).reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(keys), len(keys)))
-    _, label = connected_components(graph, directed=True, connection=connection)
-    lengths = np.bincount(label, [lane.length for lane in lanes.values()])
-    return {key for key in keys if label[index[key]] == lengths.argmax()} if keys else set()
+    label = _components(keys, onward, connection)
+    largest = np.bincount(label, [lane.length for lane in lanes.values()]).argmax()
+    return {key for key, own in zip(keys, label, strict=True) if own == largest}

@@ -10,16 +10,50 @@ from itertools import pairwise
 
 import numpy as np
 
-from gridsim.jit import freeze
-from gridsim.maps.lanes import FORKS, LANE_STEP, find_crossings
+from gridsim.jit import freeze, njit
+from gridsim.maps.lanes import FORKS, LANE_STEP
 from gridsim.maps.network import Network
 from gridsim.maps.real.description import Lane, groups_of, joined, part_of
+from gridsim.maps.real.select import on_rings
 
+APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
 LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
+ACROSS = 60.0  # m, of ways across a junction that are made one lane, at most
+ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
 WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
 NEAR_END = 25.0  # m from a road's end within which what crosses it is part of the junction there
 _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
+ASKEW = 1.0  # m, half the difference of a car's length and width: how much farther a car reaches that is turned
 _SAME = 0.5  # m within which two lanes begin at the same place
+
+
+@njit
+def _near(one, other, width, height, gap):
+    """Whether cars on two polylines [n, 2] may touch: they are within `gap` m, or a bit more where they are askew."""
+    for i in range(len(one) - 1):
+        ux, uy = one[i + 1, 0] - one[i, 0], one[i + 1, 1] - one[i, 1]
+        x, y = one[i, 0] + 0.5 * ux, one[i, 1] + 0.5 * uy
+        for j in range(len(other) - 1):
+            vx, vy = other[j + 1, 0] - other[j, 0], other[j + 1, 1] - other[j, 1]
+            dx, dy = other[j, 0] + 0.5 * vx - x, other[j, 1] + 0.5 * vy - y
+            dx, dy = dx - width * round(dx / width), dy - height * round(dy / height)
+            if abs(dx) < gap + 1.0 and abs(dy) < gap + 1.0:
+                sine = abs(ux * vy - uy * vx) / math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy) + 1e-12)
+                if math.sqrt(dx * dx + dy * dy) < gap + sine * ASKEW:
+                    return True
+    return False
+
+
+@njit
+def _find_conflicts(points, offsets, candidates, width, height, gap):
+    """Which of the candidates, pairs of lanes, conflict: bool [lanes, lanes], symmetric."""
+    cross = np.zeros_like(candidates)
+    for i in range(len(cross)):
+        one = points[offsets[i] : offsets[i + 1]]
+        for j in range(i + 1, len(cross)):
+            if candidates[i, j] and _near(one, points[offsets[j] : offsets[j + 1]], width, height, gap):
+                cross[i, j] = cross[j, i] = True
+    return cross
 
 
 class Conflicts:
@@ -33,10 +67,10 @@ class Conflicts:
         offsets = np.concatenate([[0], np.cumsum([len(line) for line in self.lines])]).astype(np.int32)
         middle, half = boxes_of(points, offsets)
         apart = abs(_short(middle[:, None] - middle[None], size)) - half[:, None] - half[None]
-        candidates = (apart < gap).all(axis=2)
+        candidates = (apart < gap + ASKEW).all(axis=2)
         for row in self._related(lanes):
             candidates[np.ix_(row, row)] = False
-        self.cross = find_crossings(points, offsets, candidates, *size, gap)
+        self.cross = _find_conflicts(points, offsets, candidates, *size, gap)
         self.gap, self.size = gap, size
 
     def _related(self, lanes: dict[str, Lane]) -> Iterable[list[int]]:
@@ -63,7 +97,7 @@ class Conflicts:
         line = self.lines[self.index[key]]
         others = np.concatenate([self.lines[k] for k in np.flatnonzero(self.cross[self.index[key]])])
         away = _short(line[:, None] - others[None], self.size)
-        near = np.flatnonzero((np.hypot(away[..., 0], away[..., 1]) < self.gap + LANE_STEP).any(axis=1))
+        near = np.flatnonzero((np.hypot(away[..., 0], away[..., 1]) < self.gap + ASKEW).any(axis=1))
         step = np.hypot(*np.diff(line, axis=0).T).mean()
         return (float(near[0] * step), float(near[-1] * step)) if len(near) else (0.0, 0.0)
 
@@ -124,6 +158,73 @@ def _merge(lanes: dict[str, Lane], crossed: set[str]) -> None:
                 lanes[key] = joined(lanes[key], lanes.pop(other))
                 for last in lanes[key].successors:
                     before[last] = [key if k == other else k for k in before[last]]
+
+
+def _absorb(lanes: dict[str, Lane]) -> None:
+    """Make short lanes part of all that lead to them, or of all that follow them."""
+    before = predecessors(lanes)
+    for key in sorted(lanes, key=lambda name: lanes[name].length):
+        lane, first = lanes[key], before[key]
+        if lane.length > APPROACH or key in lane.successors or not first:
+            continue
+        beside = LEAST / 2 if not all(_is_alone(lanes[k]) for k in (*first, *lane.successors)) else LEAST
+        if lane.length <= APPROACH and all(lanes[p].successors == [key] and _is_alone(lanes[p]) for p in first):
+            beside = APPROACH
+        if lane.length > beside:
+            continue
+        if all(lanes[p].successors == [key] for p in first):
+            for p in first:
+                lanes[p] = joined(lanes[p], lane)
+            for s in lane.successors:
+                before[s] = [p for p in before[s] if p != key] + first
+        elif all(before[s] == [key] for s in lane.successors):
+            for s in lane.successors:
+                lanes[s] = replace(joined(lane, lanes[s]), left_lane=lanes[s].left_lane, right_lane=lanes[s].right_lane)
+                before[s] = list(first)
+            for p in first:
+                lanes[p].successors = [s for s in lanes[p].successors if s != key] + lane.successors
+        else:
+            continue
+        for beside in (lane.left_lane, lane.right_lane):
+            if beside in lanes:
+                other = lanes[beside]
+                other.left_lane = "" if other.left_lane == key else other.left_lane
+                other.right_lane = "" if other.right_lane == key else other.right_lane
+        del lanes[key]
+
+
+def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
+    """Make lanes that follow each other inside of a junction one way across it, on which no car has to wait.
+
+    A lane before a fork becomes one for each branch. In roundabouts cars wait.
+    """
+    before = predecessors(lanes)
+    crossed = {key for key in lanes if key in conflicts}
+    few = {key for key in crossed if conflicts.cross[conflicts.index[key]].sum() <= ROUNDABOUT}
+    crossed -= on_rings({key: [s for s in lanes[key].successors if s in few] for key in few})
+    for key in sorted(crossed, key=lambda name: lanes[name].length):
+        lane = lanes[key]
+        onward = [s for s in lane.successors if s in crossed and s != key]
+        if not before[key] or not onward or any(s in lane.successors for s in before[key]):
+            continue
+        if set(onward) != set(lane.successors) or not _is_alone(lane):
+            continue
+        if lane.length + max(lanes[s].length for s in onward) > ACROSS:
+            continue
+        names = {s: f"{key}>{s}" for s in onward}
+        for s, name in names.items():
+            lanes[name] = replace(joined(lane, lanes[s]), left_lane="", right_lane="")
+            crossed.add(name)
+            before[name] = list(before[key])
+            before[s] = [p for p in before[s] if p != key]
+            for last in lanes[s].successors:
+                before[last].append(name)
+        for p in before[key]:
+            lanes[p].successors = [k for k in lanes[p].successors if k != key] + list(names.values())
+        del lanes[key]
+    for key in [key for key in lanes if not before[key]]:  # nothing leads to them any more
+        for s in lanes.pop(key).successors:
+            before[s] = [p for p in before[s] if p != key]
 
 
 def _group_of(lanes: dict[str, Lane], key: str) -> list[str]:
@@ -232,8 +333,11 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
     lanes = {key: replace(lane, successors=list(lane.successors)) for key, lane in lanes.items()}
     _apart_at_ends(lanes, gap)
     for _ in range(3):
+        _absorb(lanes)
         conflicts = Conflicts(lanes, gap, size)
         _merge(lanes, {key for key in lanes if key in conflicts})
+        conflicts = Conflicts(lanes, gap, size)
+        _contract(lanes, conflicts)
         _lengthen(lanes)
         _clear_roads(lanes, Conflicts(lanes, gap, size))
     return lanes, Conflicts(lanes, gap, size)
@@ -249,7 +353,8 @@ def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Net
     index = conflicts.index
     for key, lane in lanes.items():  # where a file leaves a gap, or its bounds do not quite meet
         for s in lane.successors:
-            lines[index[s]][0] = lines[index[key]][-1]
+            away = lines[index[key]][-1] - lines[index[s]][0]
+            lines[index[s]][0] += _short(away, conflicts.size)
     points = np.concatenate(lines).astype(np.float32)
     offsets = np.concatenate([[0], np.cumsum([len(line) for line in lines])]).astype(np.int32)
     lengths = np.array([np.hypot(*np.diff(line, axis=0).T).sum() for line in lines])

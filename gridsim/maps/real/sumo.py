@@ -65,9 +65,14 @@ def convert(path: Path, data: bytes, kind: str, root: Element, box: str = "") ->
             notes.append("traffic keeps left, as the country of the coordinates does")
     else:
         lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data
-    options += ["--lefthand"] * lefthand + [f"--keep-edges.in-geo-boundary={box}"] * bool(box)
+    # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
+    # what it makes of the file as one that keeps right is right but for the direction.
+    turned = lefthand and kind == "opendrive" and root.find("junction") is None
+    options += ["--lefthand"] * (lefthand and not turned) + [f"--keep-edges.in-geo-boundary={box}"] * bool(box)
     net = _netconvert(path, data, kind, options)
     road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else {})
+    if turned:
+        _turn_round(road)
     road.format, road.notes = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE"}[kind], notes + road.notes
     return road
 
@@ -209,6 +214,17 @@ def _curve(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     )
     t = np.linspace(0.0, 1.0, 16)[:, None]
     return (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
+
+
+def _turn_round(road: RealRoad) -> None:
+    """Reverse the driving direction of all lanes."""
+    before: dict[str, list[str]] = {key: [] for key in road.lanes}
+    for key, lane in road.lanes.items():
+        for other in lane.successors:
+            before[other].append(key)
+    for key, lane in road.lanes.items():
+        lane.left, lane.right = lane.right[::-1], lane.left[::-1]
+        lane.left_lane, lane.right_lane, lane.successors = lane.right_lane, lane.left_lane, before[key]
 
 
 def _set_neighbours(lanes: dict[str, Lane], one: str, other: str) -> None:
