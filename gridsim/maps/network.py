@@ -6,6 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, U, freeze, leaf, njit
@@ -167,6 +169,14 @@ def make_network(lanes: Network, road: Road, config: SimConfig, paces: np.ndarra
     room[np.repeat(beside, np.diff(offsets))] = 0.0
     _ease(offsets, steps, successors, F(traffic.taper), room)
     return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))
+
+
+def junctions(network: Network) -> int:
+    """How many junctions there are: sets of lanes that conflict with one another."""
+    lanes = np.repeat(np.arange(len(network.steps)), np.diff(network.crossing_offsets))
+    pairs = np.ones(len(lanes), dtype=np.bool_), (lanes, network.crossings)
+    count, label = connected_components(coo_matrix(pairs, shape=(len(network.steps),) * 2), directed=False)
+    return int((np.bincount(label, minlength=count) > 1).sum())
 
 
 @leaf

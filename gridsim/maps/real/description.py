@@ -41,6 +41,9 @@ class RealRoad:
     format: str  # its name in words
     lanes: dict[str, Lane]
     junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
+    degrees: tuple[
+        float, ...
+    ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property

@@ -19,7 +19,7 @@ FLATTENING_SQUARED = 0.00669438  # first eccentricity squared of WGS84
 
 def read_lanelet2(root: Element) -> RealRoad:
     """The lanelets for cars of a Lanelet2 file."""
-    places, local = _places(root)
+    places, degrees = _places(root)
     ways = {way.get("id", ""): [nd.get("ref", "") for nd in way.iterfind("nd")] for way in root.iterfind("way")}
     dashed = {way.get("id", "") for way in root.iterfind("way") if _may_cross(_tags(way))}
     lanes: dict[str, Lane] = {}
@@ -50,7 +50,8 @@ def read_lanelet2(root: Element) -> RealRoad:
         sides[key] = chosen[0][0], chosen[1][0]
     _connect(lanes, ends, sides, dashed)
     road = RealRoad("Lanelet2", lanes)
-    if not local:
+    road.degrees = degrees
+    if degrees:
         road.notes.append("latitude and longitude were projected to metres around the middle of the file")
     if others:
         road.notes.append(f"{others} lanelets that are not for cars were left out")
@@ -77,8 +78,8 @@ def _connect(
                 lane.left_lane, lanes[other].right_lane = other, key
 
 
-def _places(root: Element) -> tuple[dict[str, tuple[float, float, float]], bool]:
-    """x, y, z (m) of nodes, and whether they are the file's own metres."""
+def _places(root: Element) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...]]:
+    """x, y, z (m) of nodes, and `RealRoad.degrees`."""
     own, degrees = {}, {}
     for node in root.iterfind("node"):
         tags, key = _tags(node), node.get("id", "")
@@ -91,12 +92,17 @@ def _places(root: Element) -> tuple[dict[str, tuple[float, float, float]], bool]
         if abs(lat) <= 90.0 and abs(lon) <= 180.0:
             degrees[key] = (lat, lon, z)
     if len(own) >= len(degrees):
-        return own, True
+        return own, ()
     lat, lon = (float(np.median([place[k] for place in degrees.values()])) for k in (0, 1))
     bent = 1.0 - FLATTENING_SQUARED * math.sin(math.radians(lat)) ** 2
     north = math.radians(RADIUS * (1.0 - FLATTENING_SQUARED) / bent**1.5)
     east = math.radians(RADIUS / math.sqrt(bent) * math.cos(math.radians(lat)))
-    return {key: ((b - lon) * east, (a - lat) * north, z) for key, (a, b, z) in degrees.items()}, False
+    return {key: ((b - lon) * east, (a - lat) * north, z) for key, (a, b, z) in degrees.items()}, (
+        lon,
+        lat,
+        east,
+        north,
+    )
 
 
 def _aligned(nodes: list[list[str]], places: dict[str, tuple[float, float, float]]) -> list[list[str]]:

@@ -42,17 +42,21 @@ FASTEST = 27.0  # m/s, of the interval
 
 
 def read_road(path: Path, crop: tuple[float, float, float] | None = None) -> RealRoad:
-    """The roads of a file as it has them, in a square of `crop` (x or longitude... , y, side in m) alone."""
+    """The roads of a file as it has them, with a crop those in a square: its middle and its side in m.
+
+    The middle is latitude and longitude where the file's places are, else x and y in m.
+    """
     data = read_content(path)
     root = parse(path, data)
     kind = format_of(path, data, root)
-    if kind == "commonroad":
-        return read_commonroad(root)
-    if kind == "lanelet2":
-        return read_lanelet2(root)
-    if kind == "sumo":
-        return read_net(root, {})
-    return convert(path, data, kind, root)
+    if kind == "osm":
+        return convert(path, data, kind, root, crop)
+    readers = {"commonroad": read_commonroad, "lanelet2": read_lanelet2, "sumo": read_net}
+    road = readers[kind](root) if kind in readers else convert(path, data, kind, root)
+    if crop is not None:
+        middle = np.array(crop[:2])
+        select.cropped(road, (middle[::-1] - road.degrees[:2]) * road.degrees[2:] if road.degrees else middle, crop[2])
+    return road
 
 
 @dataclass
@@ -144,7 +148,12 @@ def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
     extent = np.maximum(np.ptp(points, axis=0) + 2 * OUTSIDE + 1, SHORTEST_SIDE)
     sides = 2.0 ** np.ceil(np.log2(extent))
     if sides.prod() * CELLS_PER_UNIT**2 > MAX_NODES:
-        raise GridSimError(f"a world of {sides[0]:,.0f} m x {sides[1]:,.0f} m is too large; crop it")
+        x, y = points.min(axis=0) + np.ptp(points, axis=0) / 2
+        raise GridSimError(
+            f"a world of {sides[0]:,.0f} m x {sides[1]:,.0f} m (its sides are powers of two) is too large: at most "
+            f"{MAX_NODES / CELLS_PER_UNIT**2:,.0f} square metres; crop it: FILE@X,Y,METRES or FILE@LAT,LON,METRES, "
+            f"2,000 m at most; the middle of its roads is at x {x:.0f} m, y {y:.0f} m"
+        )
     return sides
 
 
@@ -186,6 +195,11 @@ def file_digest(name: str) -> str:
 def load(name: str, digest: str, config: SimConfig) -> Map:
     """The map of a file with this digest."""
     return map_of(name, prepared(name, digest, gap_of(config)), config)
+
+
+def described(name: str, config: SimConfig) -> Prepared:
+    """What was read of a file."""
+    return prepared(os.path.abspath(name), file_digest(name), gap_of(config))
 
 
 def gap_of(config: SimConfig) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -16,14 +18,13 @@ END = 3.0  # m from a lane's end, within which lanes meet and do not cross
 
 
 def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
-    """These lanes alone, without references to others."""
-    lanes = {key: lane for key, lane in lanes.items() if key in kept}
+    """Copies of these lanes alone, without references to others."""
+    lanes = {key: replace(lane) for key, lane in lanes.items() if key in kept}
     for lane in lanes.values():
         lane.successors = [key for key in dict.fromkeys(lane.successors) if key in kept]
         lane.left_lane = lane.left_lane if lane.left_lane in kept else ""
         lane.right_lane = lane.right_lane if lane.right_lane in kept else ""
-        # A relation that one side does not confirm is none.
-    for key, lane in lanes.items():
+    for key, lane in lanes.items():  # a neighbour that does not confirm it is none
         if lane.left_lane and lanes[lane.left_lane].right_lane != key:
             lane.left_lane = ""
         if lane.right_lane and lanes[lane.right_lane].left_lane != key:

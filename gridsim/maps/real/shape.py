@@ -167,10 +167,10 @@ def _absorb(lanes: dict[str, Lane]) -> None:
         lane, first = lanes[key], before[key]
         if lane.length > APPROACH or key in lane.successors or not first:
             continue
-        beside = LEAST / 2 if not all(_is_alone(lanes[k]) for k in (*first, *lane.successors)) else LEAST
+        limit = LEAST / 2 if not all(_is_alone(lanes[k]) for k in (*first, *lane.successors)) else LEAST
         if lane.length <= APPROACH and all(lanes[p].successors == [key] and _is_alone(lanes[p]) for p in first):
-            beside = APPROACH
-        if lane.length > beside:
+            limit = APPROACH
+        if lane.length > limit:
             continue
         if all(lanes[p].successors == [key] for p in first):
             for p in first:

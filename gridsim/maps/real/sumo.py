@@ -18,6 +18,7 @@ from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_rep
 
 INSTALL = "pip install 'gridsim[roads]'"
 TIME_LIMIT = 120.0  # s
+METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
     "osm": [
         "--keep-edges.by-vclass=passenger", "--geometry.remove", "--junctions.join", "--osm.layer-elevation=6",
@@ -53,14 +54,20 @@ def keeps_left(latitude: float, longitude: float) -> bool:
     return inside(LEFT_HAND) and not inside(RIGHT_HAND)
 
 
-def convert(path: Path, data: bytes, kind: str, root: Element, box: str = "") -> RealRoad:
-    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file. `box`: netconvert's, of what to keep of it."""
+def convert(
+    path: Path, data: bytes, kind: str, root: Element, crop: tuple[float, float, float] | None = None
+) -> RealRoad:
+    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part."""
     options, notes = list(OPTIONS[kind]), []
     if kind == "osm":
         places = np.array([(float(n.get("lat", "nan")), float(n.get("lon", "nan"))) for n in root.iterfind("node")])
         if not len(places):
             raise GridSimError(f"{path}: it has no nodes; is it an extract of OpenStreetMap in XML?")
         lefthand = keeps_left(*np.nanmedian(places, axis=0))
+        if crop:
+            half = np.array([crop[2], crop[2] / max(math.cos(math.radians(crop[0])), 0.01)]) / 2 / METRES_PER_DEGREE
+            (south, west), (north, east) = crop[:2] - half, crop[:2] + half
+            options.append(f"--keep-edges.in-geo-boundary={west},{south},{east},{north}")
         if lefthand:
             notes.append("traffic keeps left, as the country of the coordinates does")
     else:
@@ -68,9 +75,9 @@ def convert(path: Path, data: bytes, kind: str, root: Element, box: str = "") ->
     # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
     # what it makes of the file as one that keeps right is right but for the direction.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
-    options += ["--lefthand"] * (lefthand and not turned) + [f"--keep-edges.in-geo-boundary={box}"] * bool(box)
+    options += ["--lefthand"] * (lefthand and not turned)
     net = _netconvert(path, data, kind, options)
-    road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else {})
+    road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else None)
     if turned:
         _turn_round(road)
     road.format, road.notes = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE"}[kind], notes + road.notes
@@ -122,7 +129,7 @@ def _limits(root: Element) -> dict[str, float]:
     return found
 
 
-def read_net(root: Element, limits: dict[str, float]) -> RealRoad:
+def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
     """A SUMO net. Each connection is a lane of its own through its junction; `limits` are by the road that it was."""
     inner: dict[str, Element] = {}
     lanes: dict[str, Lane] = {}
@@ -143,7 +150,7 @@ def read_net(root: Element, limits: dict[str, float]) -> RealRoad:
                 closed, before = closed + 1, ""
                 continue
             origin = element.find("param[@key='origId']")
-            limit = limits.get("" if origin is None else origin.get("value", "").split("_")[0], math.nan)
+            limit = (limits or {}).get("" if origin is None else origin.get("value", "").split("_")[0], math.nan)
             speed = float(element.get("speed", "nan")) if math.isnan(limit) else limit
             lanes[name] = Lane(*bounds_of(line, _width(element)), speed, junction="")
             numbered[key, int(element.get("index", "0"))] = name
