@@ -18,6 +18,9 @@ SLIT = 2  # pixels around the road in which walls that are as thin on both sides
 ISLAND = 30.0  # m2; smaller walls inside of junctions are taken for gaps, too
 _REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, of the longest distance in the field
 
+SHARP = 0.15  # rad
+SWEPT = 2.5  # m around a sharp bend that a car's corners may pass
+_CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
 _OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1
 
 
@@ -30,6 +33,10 @@ def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.nd
         left, right = lane.left[:, :2], lane.right[:, :2]
         for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
             _fill(draw, quad, size)
+        middle = (left + right) / 2
+        onward = [middle[-1:] + np.diff(lanes[key].centre[:2, :2], axis=0) for key in lane.successors]
+        for corner in np.concatenate([_corners(np.concatenate([middle, point])) for point in onward]):
+            _fill(draw, corner + SWEPT * _CIRCLE, size)
     for outline in outlines:
         _fill(draw, outline, size)
     free = np.asarray(picture)
@@ -51,6 +58,13 @@ def _window(used: np.ndarray) -> np.ndarray:
         first, last = 0, len(used) - 1
     first = (first - 2 * _REACH) // FINE * FINE
     return np.arange(first, first + math.ceil((last + 2 * _REACH - first) / FINE) * FINE)
+
+
+def _corners(line: np.ndarray) -> np.ndarray:
+    """Points [n, 2] of a line at which it bends so sharply that a car's ends leave the lane."""
+    step = np.diff(line, axis=0)
+    turn = np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+    return line[1:-1][abs(turn) > SHARP]
 
 
 def _fill(draw: ImageDraw.ImageDraw, outline: np.ndarray, size: np.ndarray) -> None:

@@ -133,9 +133,9 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
         lane.left, lane.right = lane.left - shift, lane.right - shift
     used = {lane.junction for lane in road.lanes.values()}
     outlines = [outline - origin for key, outline in road.junctions.items() if key in used]
-    nodes = clearance_of(road.lanes, outlines, size)
     hand = hand_of(road.lanes)
     lanes, conflicts = shaped(road.lanes, gap, size)
+    nodes = clearance_of(lanes, outlines, size)
     network = network_of(lanes, conflicts, hand)
     limits = np.array([lane.speed for lane in lanes.values()])
     limits[~(limits >= SLOWEST_LIMIT)] = USUAL_LIMIT

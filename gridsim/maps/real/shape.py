@@ -18,7 +18,8 @@ from gridsim.maps.real.select import on_rings
 
 APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
 LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
-ACROSS = 60.0  # m, of ways across a junction that are made one lane, at most
+ABREAST = 4.8  # m between lanes side by side, at most
+ACROSS = 100.0  # m, of ways across a junction that are made one lane, at most
 ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
 WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
 NEAR_END = 25.0  # m from a road's end within which what crosses it is part of the junction there
@@ -51,7 +52,16 @@ def _find_conflicts(points, offsets, candidates, width, height, gap):
     for i in range(len(cross)):
         one = points[offsets[i] : offsets[i + 1]]
         for j in range(i + 1, len(cross)):
-            if candidates[i, j] and _near(one, points[offsets[j] : offsets[j + 1]], width, height, gap):
+            if not candidates[i, j]:
+                continue
+            other, k = points[offsets[j] : offsets[j + 1]], 0
+            if math.hypot(one[0, 0] - other[0, 0], one[0, 1] - other[0, 1]) < _SAME:  # only behind their fork
+                while (
+                    k < min(len(one), len(other))
+                    and math.hypot(one[k, 0] - other[k, 0], one[k, 1] - other[k, 1]) < 2.0 * gap
+                ):
+                    k += 1
+            if _near(one[k:], other[k:], width, height, gap):
                 cross[i, j] = cross[j, i] = True
     return cross
 
@@ -79,15 +89,12 @@ class Conflicts:
             yield [self.index[key] for key in group]
         for key, lane in lanes.items():
             here = self.index[key]
-            begins = [self.index[s] for s in lane.successors]
-            for other in begins:
+            for other in (self.index[s] for s in lane.successors):
                 yield [here, other]
                 onward = lanes[self.keys[other]]
                 if onward.length < LEAST + 3.0:
                     for last in onward.successors:
                         yield [here, self.index[last]]
-            starts = [self.lines[k][0] for k in begins]
-            yield [k for k, at in zip(begins, starts, strict=True) if math.dist(at, starts[0]) < _SAME]
 
     def __contains__(self, key: str) -> bool:
         return bool(self.cross[self.index[key]].any())
@@ -318,20 +325,20 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
             _split(lanes, group, first / length)
 
 
-def _apart_at_ends(lanes: dict[str, Lane], gap: float) -> None:
-    """Take lanes that run into one another for no neighbours."""
+def _unlink(lanes: dict[str, Lane], gap: float) -> None:
+    """Take lanes that run into one another, or apart, for no neighbours."""
     for group in groups_of(lanes):
         for left, right in pairwise(group):
             n = max(math.ceil(lanes[left].length / LANE_STEP), 1)
             away = resampled(lanes[left], n)[0] - resampled(lanes[right], n)[0]
-            if np.hypot(*away.T).min() < gap:
+            if np.hypot(*away.T).min() < gap or np.hypot(*away.T).max() > ABREAST:
                 lanes[left].right_lane = lanes[right].left_lane = ""
 
 
 def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[str, Lane], Conflicts]:
     """Lanes as traffic needs them, and which of them may collide; `gap` (m) between middle lines, size of the torus."""
     lanes = {key: replace(lane, successors=list(lane.successors)) for key, lane in lanes.items()}
-    _apart_at_ends(lanes, gap)
+    _unlink(lanes, gap)
     for _ in range(3):
         _absorb(lanes)
         conflicts = Conflicts(lanes, gap, size)
