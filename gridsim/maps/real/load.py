@@ -33,6 +33,7 @@ from gridsim.maps.real.sumo import convert, read_net
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
 from gridsim.reading import read_bytes
 
+NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
 MAX_NODES = 1 << 24  # of the field: 4 square km
 SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
@@ -108,7 +109,8 @@ def hand_of(lanes: dict[str, Lane]) -> float:
 
 def prepare(road: RealRoad, gap: float) -> Prepared:
     """Select what can be driven, and shape it."""
-    read = road.length
+    if not (read := road.length):
+        raise GridSimError(NO_ROAD)
     select.without_tight_turns(road)
     select.on_one_level(road)
     ends.add_turning_loops(road)
@@ -120,7 +122,7 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
         ends.join_round_the_world(road, size)
         joined = select.largest_joined(road.lanes)
     if not joined:
-        raise GridSimError("no road for cars on which one can drive on; is it a map of roads?")
+        raise GridSimError(NO_ROAD)
     road.lanes = joined
     if (cut := read - road.length) > 1.0:
         road.notes.append(f"{cut / 1000:.1f} of {read / 1000:.1f} km of lanes lead nowhere, or do not join the rest")
