@@ -18,7 +18,15 @@ from evolution.networks.policy import CONTINUOUS, Actions, Observation, PolicySp
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import REGISTRY, build, check_name, default_traffic, is_map_file, speed_interval
+from gridsim.maps.scenarios import (
+    REGISTRY,
+    build,
+    check_name,
+    default_traffic,
+    has_lanes,
+    is_map_file,
+    speed_interval,
+)
 from gridsim.step import parameters
 from gridsim.traffic.world import check_traffic
 
@@ -125,7 +133,7 @@ class RunSettings(ABC):
         if is_map_file(self.scenario):
             build(self.scenario, 0, sim)  # cached, so that it is read once
         self._check_range(0, MAX_TRAFFIC, "traffic")
-        if self.traffic and is_map_file(self.scenario):
+        if self.traffic and not has_lanes(self.scenario):
             raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
         check_traffic(self.traffic, sim)
         self._check_range(0, (1 << 63) - 1, "seed")

@@ -51,7 +51,7 @@ from cluster.tracking.tracking import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import is_map_file, label
+from gridsim.maps.scenarios import has_lanes, is_map_file, label
 from gridsim.reference import errors
 
 
@@ -149,7 +149,7 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         base = kind(settings, WorkFlags(output=str(run.path.parent)) if run else WorkFlags(), start)
         flags = parse(kind, prog, arguments, base)
     settings = flags.learning
-    if settings.traffic and is_map_file(settings.scenario):
+    if settings.traffic and not has_lanes(settings.scenario):
         print(f"{prog}: {settings.scenario} has no lanes for traffic; running without", file=sys.stderr)
         return _prepare(prog, [*arguments, "--traffic", "0"])
     check_workers(flags.work.workers, flags.work.patience)

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -91,12 +92,43 @@ def bounds(road_map: Map) -> list[float]:
     A map from a file is shown around its road, since its sides are rounded up to powers of two, with wall.
     """
     width, height = float(road_map.road.width), float(road_map.road.height)
-    if road_map.torus:
+    if road_map.torus and len(road_map.strips.lines):
         return [0.0, width, 0.0, height]
     nodes = node_clearance(road_map.road)
     y, x = np.nonzero(nodes > 0.0)
     margin = 5.0 * float(road_map.road.unit) * np.array([-1.0, 1.0, -1.0, 1.0])
     return (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width + margin).tolist()
+
+
+def _ground(axis: Any, scenario: Map, title: str) -> None:
+    """Draw a map's road."""
+    nodes = node_clearance(scenario.road)
+    extent = (0.0, float(scenario.road.width), 0.0, float(scenario.road.height))
+    axis.set_facecolor(_WALL)
+    axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
+    axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
+    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=drawable(title))
+    axis.axis(bounds(scenario))
+
+
+@plain_style()
+def road_map(scenario: Map, path: Path, title: str) -> None:
+    """Draw a map and its lanes to a PNG: arrows in driving direction, red where lanes cross or merge."""
+    from matplotlib.collections import LineCollection
+
+    figure, (axis,) = figure_of(12.0, 11.0)
+    _ground(axis, scenario, title)
+    network, size = scenario.network, scenario.size
+    crossed = np.diff(network.crossing_offsets) > 0
+    lanes = [network.points[a:b] for a, b in pairwise(network.offsets)]
+    for shift in product((-1, 0, 1), repeat=2) if lanes else ():
+        moved = [points + np.array(shift) * size for points in lanes]
+        axis.add_collection(LineCollection(moved, colors=np.where(crossed, "#ff6b6b", "#74c0fc"), linewidths=0.8))
+    for points in lanes:
+        one, other = points[len(points) // 2 - 1] % size, points[len(points) // 2] % size
+        style = {"arrowstyle": "-|>", "color": "#ffffff", "linewidth": 0.4, "mutation_scale": 6}
+        axis.annotate("", other, one, arrowprops=style, annotation_clip=True)
+    figure.savefig(path, dpi=100)
 
 
 @plain_style()
@@ -105,15 +137,8 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     from matplotlib.collections import LineCollection
 
     figure, (axis,) = figure_of(8.6, 7.6)
-    road = scenario.road
-    nodes = node_clearance(road)
-    width, height = float(road.width), float(road.height)
-    extent = (0.0, width, 0.0, height)
-    axis.set_facecolor(_WALL)
-    axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
-    axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
-    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=drawable(title))
-    axis.axis(bounds(scenario))
+    road, (width, height) = scenario.road, scenario.size
+    _ground(axis, scenario, title)
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
     near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(width, height) / 2

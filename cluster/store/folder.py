@@ -26,7 +26,7 @@ from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, ELITES, HISTO
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import is_map_file, label
+from gridsim.maps.scenarios import is_map_file, label, map_digest
 from gridsim.packages import DISTRIBUTION
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
@@ -107,8 +107,6 @@ def _sources(settings: RunSettings) -> dict[str, str]:
     """Digests of the user's files that a run depends on: its map's and its fitness's. Raises GridSimError."""
     found = {}
     if is_map_file(settings.scenario):
-        from gridsim.maps.files import map_digest  # imports SciPy, in 0.2 s
-
         found["map_sha256"] = map_digest(settings.scenario)
     if isinstance(settings, EvolveSettings) and settings.fitness:
         found["fitness_sha256"] = fitness.digest(settings.fitness)

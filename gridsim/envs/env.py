@@ -40,7 +40,7 @@ from gridsim.envs.episodes import Episodes
 from gridsim.envs.observing import Observer, row
 from gridsim.jit import U
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
+from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, LANE, SPEED, TERMINATES, TRUNCATES, End
@@ -116,7 +116,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"frames must be 1 to {MAX_FRAMES}, and more than 1 only for grids, not {frames}")
         if (motion or steering) and observation != "rays":
             raise ValueError(f"motion and steering are only for rays; leave them out with observation={observation!r}")
-        if traffic and is_map_file(scenario):
+        if traffic and not has_lanes(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
         self.autoreset_mode = AutoresetMode(autoreset_mode)

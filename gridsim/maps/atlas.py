@@ -19,18 +19,18 @@ class Atlas(NamedTuple):
     lanes: Network  # the arrays of all maps' networks
     bounds: np.ndarray  # int64 [maps + 1, 4], where each map's part of the field, points, lanes and crossings begin
     sides: np.ndarray  # uint32 [maps, 2], columns and rows
-    sizes: np.ndarray  # float32 [maps, 7], the other fields of `Road`
+    sizes: np.ndarray  # float32 [maps, 8], the other fields of `Road`, and `Network.hand`
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     """Concatenate maps. A single field, which may be large, is not copied."""
-    *columns, width, height = zip(*networks, strict=True)
-    lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0]])
+    *columns, width, height, hand = zip(*networks, strict=True)
+    lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0], hand[0]])
     fields = [road.field for road in roads]
     lengths = [
         (len(r.field), len(n.points), len(n.steps), len(n.crossings)) for r, n in zip(roads, networks, strict=True)
     ]
-    sizes = [tuple(r)[3:] for r in roads]
+    sizes = [(*tuple(r)[3:], n.hand) for r, n in zip(roads, networks, strict=True)]
     return Atlas(
         field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
         lanes=lanes,
@@ -67,4 +67,5 @@ def network_of(atlas: Atlas, m: int) -> Network:
         lanes.boxes[here[2] : there[2]],
         atlas.sizes[m, 0],
         atlas.sizes[m, 1],
+        atlas.sizes[m, 7],
     )

@@ -212,4 +212,4 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "boxes": boxes.astype(np.float32),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
-    return Network(**frozen, width=np.float32(width), height=np.float32(height))
+    return Network(**frozen, width=np.float32(width), height=np.float32(height), hand=np.float32(1.0))

@@ -6,9 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
-from gridsim.jit import HALF, F, U, freeze, leaf, njit
+from gridsim.jit import HALF, ZERO, F, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
@@ -33,10 +35,11 @@ class Network(NamedTuple):
     # Lanes with the same beginning, predecessors, successors and neighbours are not among them.
     crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
-    room: np.ndarray  # float32 [n], m that a car can move to the right for oncoming cars
+    room: np.ndarray  # float32 [n], m that a car can move to its side of the road for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
     width: np.float32  # m, of the torus
     height: np.float32
+    hand: np.float32  # the side of the road on which traffic drives: 1 right, -1 left
 
     def scaled(self, factor: float) -> Network:
         """All lengths multiplied by a factor, a power of two; `speeds` are kept."""
@@ -45,11 +48,11 @@ class Network(NamedTuple):
         arrays = {
             name: freeze(getattr(self, name) * F(factor)) for name in ("points", "steps", "clear", "room", "boxes")
         }
-        return self._replace(**arrays, width=self.width * F(factor), height=self.height * F(factor))
+        return self._replace(**arrays, width=self.width * F(factor), height=self.height * F(factor), hand=self.hand)
 
 
 @njit
-def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, speeds):
+def _speed_profile(points, offsets, steps, successors, tops, lateral, comfort, speeds):
     """Top speed at each point: limited by lateral acceleration, and by comfortable braking for slower points ahead."""
     lanes = offsets.shape[0] - 1
     for lane in range(lanes):
@@ -63,7 +66,8 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
             vx, vy = points[c, 0] - points[b, 0], points[c, 1] - points[b, 1]
             turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy)) if a < b else 0.0
             length = 0.5 * (math.hypot(ux, uy) + math.hypot(vx, vy))
-            speeds[p] = min(top, math.sqrt(lateral * length / max(turn, 1e-6))) if length > 1e-6 else top
+            bend = math.sqrt(lateral * length / max(turn, 1e-6)) if length > 1e-6 else tops[lane]
+            speeds[p] = min(tops[lane], bend)
     for _ in range(4):  # repeated, so that a bend also limits the lanes before it
         for lane in range(lanes):
             first, last = offsets[lane], offsets[lane + 1] - 1
@@ -98,8 +102,8 @@ def _ease(offsets, steps, successors, slope, room):
 
 
 @njit
-def _room_on_right(points, offsets, road, length, width, verge, most, room):
-    """How far (m) a car at each point can move to the right, limited by its right side; found by bisection."""
+def _room_at_side(points, offsets, road, hand, length, width, verge, most, room):
+    """How far (m) a car at each point can move to its side of the road, limited by that side; found by bisection."""
     for lane in range(offsets.shape[0] - 1):
         first, last = offsets[lane], offsets[lane + 1] - 1
         for p in range(first, last + 1):
@@ -107,11 +111,12 @@ def _room_on_right(points, offsets, road, length, width, verge, most, room):
             fx, fy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             norm = np.hypot(fx, fy)
             fx, fy = fx / norm, fy / norm
+            ux, uy = (fy, -fx) if hand > ZERO else (-fy, fx)
             low, high, tried = F(0.0), most, most
             for _ in range(7):
-                x, y = points[p, 0] + tried * fy, points[p, 1] - tried * fx
+                x, y = points[p, 0] + tried * ux, points[p, 1] + tried * uy
                 gap = clearance(road, x, y) - HALF * width
-                x, y = x + HALF * width * fy, y - HALF * width * fx
+                x, y = x + HALF * width * ux, y + HALF * width * uy
                 for share in _ALONG_SIDE:
                     along = share * length * HALF
                     gap = min(gap, clearance(road, x + along * fx, y + along * fy))
@@ -143,23 +148,35 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
             clear[c] = last * steps[other]
 
 
-def make_network(lanes: Network, road: Road, config: SimConfig) -> Network:
-    """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`."""
+def make_network(lanes: Network, road: Road, config: SimConfig, paces: np.ndarray | None = None) -> Network:
+    """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`.
+
+    `paces` float32 [lanes]: traffic's speed (m/s) on straights, where it is not the same on all lanes.
+    """
     traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
     speeds, room = np.empty((2, len(points)), dtype=np.float32)
     clear = np.empty(len(lanes.crossings), dtype=np.float32)
-    top = F(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
-    _speed_profile(points, offsets, steps, successors, top, F(traffic.lateral), F(traffic.comfort), speeds)
+    if paces is None:
+        paces = np.full(len(steps), F(TRAFFIC_PACE) * (road.speed_low + road.speed_high))
+    _speed_profile(points, offsets, steps, successors, paces, F(traffic.lateral), F(traffic.comfort), speeds)
     crossing = lanes.crossing_offsets, lanes.crossings
     apart = F(config.vehicle.width + traffic.beside)
     _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
     beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
     limits = config.vehicle.length, config.vehicle.width, traffic.verge, traffic.give_way
-    _room_on_right(points, offsets, road, *map(F, limits), room)
+    _room_at_side(points, offsets, road, lanes.hand, *map(F, limits), room)
     room[np.repeat(beside, np.diff(offsets))] = 0.0
     _ease(offsets, steps, successors, F(traffic.taper), room)
     return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))
+
+
+def junctions(network: Network) -> int:
+    """How many junctions there are: sets of lanes that conflict with one another."""
+    lanes = np.repeat(np.arange(len(network.steps)), np.diff(network.crossing_offsets))
+    pairs = np.ones(len(lanes), dtype=np.bool_), (lanes, network.crossings)
+    count, label = connected_components(coo_matrix(pairs, shape=(len(network.steps),) * 2), directed=False)
+    return int((np.bincount(label, minlength=count) > 1).sum())
 
 
 @leaf
@@ -192,6 +209,12 @@ def lane_length(network, lane):
     """Length (m) of a lane."""
     lane = U(lane)  # unsigned, here and elsewhere: Numba checks whether signed indices are negative
     return F(network.offsets[lane + U(1)] - network.offsets[lane] - 1) * network.steps[lane]
+
+
+@leaf
+def to_side(network, shift):
+    """A shift to the left as one away from the side of the road on which traffic drives, or back."""
+    return shift if network.hand > ZERO else -shift
 
 
 @leaf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -16,6 +17,8 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import clearance_nodes, make_road
 
+PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp", ".yaml", ".yml")  # files of maps without lanes
+REAL_TRAFFIC = 8  # default number of other cars on real roads
 # First seeds of the maps for training, for the choice of the champion, and for the final report and nothing else.
 TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = 0, 1_000_000, 2_000_000
 
@@ -34,22 +37,41 @@ def is_map_file(name: str) -> bool:
     return names_file(name)
 
 
+def has_lanes(name: str) -> bool:
+    """Whether a scenario has lanes, and so may have traffic: all but pictures and YAML files."""
+    return not is_map_file(name) or Path(name).suffix.lower() not in PICTURES
+
+
 def check_name(name: str) -> None:
     """Raises: GridSimError if the name is neither in the registry nor a map file's."""
     if name not in REGISTRY and not is_map_file(name):
         names = ", ".join(sorted(REGISTRY))
-        raise GridSimError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
+        raise GridSimError(f"unknown scenario {name!r}; there are: {names}, and files of maps and roads")
 
 
 def label(name: str) -> str:
-    """A short name of a scenario: for a map file, its stem."""
-    return Path(name).stem if is_map_file(name) else name
+    """A short name of a scenario: for a file, its name without what says its format."""
+    if not is_map_file(name):
+        return name
+    return re.sub(r"(\.net)?(\.\w+)(\.gz)?(@.*)?$", "", Path(name).name)
+
+
+def map_digest(name: str) -> str:
+    """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
+    if has_lanes(name):
+        from gridsim.maps.real.load import file_digest
+
+        return file_digest(name)
+    from gridsim.maps import files
+
+    return files.map_digest(name)
 
 
 def default_traffic(name: str, config: SimConfig | None = None) -> int:
-    """A scenario's default number of other cars; 0 on a map from a file, which has no lanes, and for small cars."""
-    small = config is not None and config.unit < 1.0
-    return REGISTRY[name].traffic if name in REGISTRY and not small else 0
+    """A scenario's default number of other cars; 0 on a map without lanes, and for small cars."""
+    if not has_lanes(name) or (config is not None and config.unit < 1.0):
+        return 0
+    return REGISTRY[name].traffic if name in REGISTRY else REAL_TRAFFIC
 
 
 def speed_interval(name: str, config: SimConfig) -> tuple[float, float]:
@@ -75,8 +97,12 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     check_name(name)
     if seed < 0:
         raise GridSimError(f"a seed must be 0 or more, not {seed}")
-    if is_map_file(name):
-        from gridsim.maps.files import load_map  # imported here, because workers never read files
+    if is_map_file(name):  # imported here, because workers never read files
+        if has_lanes(name):
+            from gridsim.maps.real.load import load_road
+
+            return load_road(name, config)
+        from gridsim.maps.files import load_map
 
         return load_map(name, config)
     spec = REGISTRY[name]

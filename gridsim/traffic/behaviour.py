@@ -17,7 +17,7 @@ from gridsim import config
 from gridsim import state as s
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import HALF, ONE, ZERO, F, I, U, leaf, njit
-from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
+from gridsim.maps.network import is_junction, lane_length, to_side, torus_distance, wrapped, wrapped_any
 from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import choose_lane, lane_after, lane_change_steps, point_at, set_pose
@@ -108,7 +108,8 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     """Distance (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
 
     Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's place to `furthest`
-    m right of the lane, or as far as there is room; on a road with several lanes there is none: it returns to the lane.
+    m to its side of the road, or as far as there is room; on a road with several lanes there is none: it returns to the
+    lane.
     """
     shift, sway = car[s.SHIFT], car[s.SWAY]
     aside_by = furthest > ZERO or shift != ZERO
@@ -137,7 +138,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
                 k = first + U(I(along / step))
                 px, py = network.points[k, 0], network.points[k, 1]
                 if aside_by:
-                    place = -min(network.room[k], furthest)
+                    place = to_side(network, -min(network.room[k], furthest))
                     shift, sway = _swerve(drivers, car[s.SPEED], shift, sway, place, travelled - swerved)
                     swerved = travelled
                     px, py = shifted_right(network, k, k + U(1) if along + step <= length else k - U(1), -shift)
@@ -168,10 +169,10 @@ def update_gap(network, drivers, car, other, is_ego):
         # Nor is a car in another lane, if neither changes lanes.
         keep = other[s.SHIFT] == ZERO and car[s.SHIFT] == ZERO
         done = done or at < F(1e8) or (keep and max(network.left[lane], network.right[lane]) >= 0)
-    right = max(-car[s.SHIFT], ZERO)
+    aside = max(-to_side(network, car[s.SHIFT]), ZERO)
     if not done:
         near = min(car[s.HORIZON], car[s.GAP])  # only obstacles nearer than the nearest so far matter
-        furthest = F(1e9) if is_ego and meets_ego(network, drivers, car, other) else right
+        furthest = F(1e9) if is_ego and meets_ego(network, drivers, car, other) else aside
         at = _in_the_way(network, drivers, car, other[s.X], other[s.Y], other[s.COS], other[s.SIN], near, furthest)
     if at < car[s.GAP]:
         car[s.GAP], car[s.LEAD_SPEED] = at, along
@@ -182,7 +183,7 @@ def update_gap(network, drivers, car, other, is_ego):
             # The ego car's position in a second, as it may be about to cut in.
             x, y = other[s.X] + other[s.SPEED] * other[s.COS], other[s.Y] + other[s.SPEED] * other[s.SIN]
             near = min(car[s.HORIZON], car[s.GAP])
-            at = _in_the_way(network, drivers, car, x, y, other[s.COS], other[s.SIN], near, right)
+            at = _in_the_way(network, drivers, car, x, y, other[s.COS], other[s.SIN], near, aside)
         if at < car[s.GAP]:
             car[s.GAP], car[s.LEAD_SPEED] = at, along
 
@@ -231,7 +232,8 @@ def change_lanes(network, drivers, world, i, ego):
         return
     car[s.LANE_TIMER] = drivers.lane_change_steps - ONE
     lane = I(car[s.LANE])
-    if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0:
+    near = is_junction(network, I(car[s.NEXT])) and lane_length(network, lane) - car[s.ALONG] < config.KEEP_LANE
+    if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0 and not near:
         _choose_neighbour(network, drivers, world, i, ego)
 
 
@@ -279,7 +281,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
     desired = _desired(network, car)
     best, gain = I(-1), drivers.threshold
     for side in range(2):
-        target = network.left[lane] if side == 0 else network.right[lane]
+        target = network.left[lane] if (side == 0) == (network.hand > ZERO) else network.right[lane]
         if target < 0:
             continue
         along = car[s.ALONG] / network.steps[lane] * network.steps[target]
@@ -309,7 +311,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 forward = dx * car[s.COS] + dy * car[s.SIN]  # the ego car is on no lane
                 aside = dy * car[s.COS] - dx * car[s.SIN]
                 reach = HALF * apart + drivers.half_width + config.NEIGHBOUR_WIDENING * forward * forward
-                sideways = apart if side == 0 else -apart
+                sideways = apart if target == network.left[lane] else -apart
                 ahead = forward if abs(aside - sideways) <= reach else F(1e9)
                 behind = -forward if abs(aside) <= reach else F(-1e9)
                 wish = other[s.SPEED]
@@ -344,7 +346,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         apart = _lanes_apart(network, lane, along, best)
         car[s.SHIFT] = -apart if best == network.left[lane] else apart
         car[s.ALONG] = along / network.steps[lane] * network.steps[best]
-        car[s.LANE] = F(best)
+        car[s.LANE], car[s.PERMIT] = F(best), -ONE
         car[s.NEXT] = F(choose_lane(network, best, car))
         car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
         # While it moves over, it must not touch the car ahead in its old lane.
@@ -366,7 +368,7 @@ def _move(network, drivers, car, ego):
     before, after = car[s.SPEED], max(car[s.SPEED] + car[s.ACCELERATION] * drivers.dt, ZERO)
     car[s.ALONG] += HALF * (before + after) * drivers.dt
     car[s.SPEED] = after
-    place = -network.room[point_at(network, car)] if meets_ego(network, drivers, car, ego) else ZERO
+    place = to_side(network, -network.room[point_at(network, car)]) if meets_ego(network, drivers, car, ego) else ZERO
     shift = car[s.SHIFT]
     if shift != place or car[s.SWAY] != ZERO:
         way = HALF * (before + after) * drivers.dt

@@ -9,7 +9,7 @@ from gridsim.car.kinematic import advance, path_curvature
 from gridsim.collision import boxes_touch
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
-from gridsim.maps.network import lane_length, wrapped, wrapped_any
+from gridsim.maps.network import lane_length, to_side, wrapped, wrapped_any
 from gridsim.traffic.world import lane_after
 
 
@@ -19,7 +19,7 @@ def meets_ego(network, drivers, car, ego):
 
     A car that has already moved to the right stays there until the ego car has passed.
     """
-    if car[s.COS] * ego[s.COS] + car[s.SIN] * ego[s.SIN] > SAME_WAY_COSINE and car[s.SHIFT] >= ZERO:
+    if car[s.COS] * ego[s.COS] + car[s.SIN] * ego[s.SIN] > SAME_WAY_COSINE and to_side(network, car[s.SHIFT]) >= ZERO:
         return False  # they go the same way
     dx, dy = wrapped(ego[s.X] - car[s.X], network.width), wrapped(ego[s.Y] - car[s.Y], network.height)
     behind = F(-2.0) * drivers.half_length
@@ -74,8 +74,8 @@ def way_to_ego_collision(network, drivers, car, ego):
             length = lane_length(network, lane)
         k = U(network.offsets[U(lane)]) + U(I((way - begin) / network.steps[U(lane)]))
         k = min(k, U(network.offsets[U(lane) + U(1)]) - U(2))
-        right = min(network.room[k], drivers.lane_change_speed * t - car[s.SHIFT])
-        px, py = shifted_right(network, k, k + U(1), right)
+        aside = min(network.room[k], drivers.lane_change_speed * t - to_side(network, car[s.SHIFT]))
+        px, py = shifted_right(network, k, k + U(1), to_side(network, aside))
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, ZERO, curvature, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
         if dx * dx + dy * dy > contact * contact:

@@ -18,6 +18,7 @@ def _blocked_by_waiting_car(network, drivers, lane, other):
     """Whether the rear of a car that waits at the end of `other` blocks a lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - I((F(2.0) * drivers.half_length + drivers.jam) / step)
+    q = max(q, network.offsets[other])
     reach = F(2.0) * drivers.half_width + F(2.0) * config.CAUTION
     for p in range(network.offsets[lane], network.offsets[lane + 1]):
         dx = wrapped_any(network.points[p, 0] - network.points[q, 0], network.width)

@@ -1,0 +1,69 @@
+"""gridsim-map: what was read of a file of roads, and a picture of it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from cluster.commands.common import main, parse, short_path
+from cluster.settings import IN_WORDS
+from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
+from gridsim.maps.network import junctions
+from gridsim.maps.scenarios import build, check_name, has_lanes, is_map_file, label
+
+MAP = "gridsim-map"
+
+
+@dataclass(frozen=True)
+class MapFlags:
+    """Say what a file of roads or a map holds and what of it was left out, and draw it."""
+
+    example: ClassVar[str] = "gridsim-map town.osm --crop 52.473,13.44,400 --output town.png"
+    file: tyro.conf.Positional[str]
+    """OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad, Lanelet2; a picture or a map's YAML; or a scenario."""
+    crop: Annotated[str, IN_WORDS] = ""
+    """Read only a square: LAT,LON,METRES of its middle and its side; X,Y,METRES where a file is in metres."""
+    output: Annotated[str, IN_WORDS] = ""
+    """Draw it to this .png."""
+
+
+def _map() -> int:
+    flags = parse(MapFlags, MAP, sys.argv[1:])
+    if flags.output and Path(flags.output).suffix != ".png":
+        raise GridSimError(f"--output {flags.output}: a picture is a .png")
+    name, config = flags.file + (f"@{flags.crop}" if flags.crop else ""), SimConfig()
+    check_name(name)
+    here = build(name, 0, config)
+    road, network = here.road, here.network
+    if is_map_file(name) and has_lanes(name):
+        from gridsim.maps.real.load import described, split_crop
+
+        if flags.crop and split_crop(name)[1] is None:
+            raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")
+        found = described(name, config)
+        print(f"{flags.file}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
+        print(f"  the map's lower left corner is the file's x {found.origin[0]:g} m, y {found.origin[1]:g} m")
+    if len(network.steps):
+        side = "right" if network.hand > 0.0 else "left"
+        print(f"{here.mileage[-1] / 1000:.1f} km of lanes, {junctions(network)} junctions, traffic keeps {side}")
+    else:
+        print(f"no lanes, {len(here.starts)} starts")
+    print(f"{road.width:g} m x {road.height:g} m; speed counts from {road.speed_low:.1f} to {road.speed_high:.1f} m/s")
+    if flags.output:
+        from cluster.report.pictures import road_map
+
+        road_map(here, Path(flags.output), label(name))
+        print(f"picture: {short_path(Path(flags.output))}")
+    if is_map_file(name):
+        print(f"train a driver: gridsim-evolve --scenario {shlex.quote(name)}")
+    return 0
+
+
+map_main = partial(main, MAP, _map)

@@ -1,0 +1,61 @@
+"""A file's bytes and its format, told by its content. XML with entities is refused, and so is what is too large."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import zlib
+from pathlib import Path
+from xml.etree import ElementTree
+
+from gridsim.errors import GridSimError
+from gridsim.reading import MAX_BYTES, read_bytes, shown
+
+Element = ElementTree.Element
+FORMATS = "OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad and Lanelet2"
+
+
+def read_content(path: Path) -> bytes:
+    """A file's bytes, unpacked if they are a .gz."""
+    data = read_bytes(path)
+    if data[:2] == b"\x1f\x8b":
+        try:
+            data = gzip.GzipFile(fileobj=io.BytesIO(data)).read(MAX_BYTES + 1)
+        except (OSError, EOFError, zlib.error):
+            raise GridSimError(f"{path}: a truncated or damaged .gz") from None
+        if len(data) > MAX_BYTES:
+            raise GridSimError(f"{path}: more than {MAX_BYTES >> 20} MiB when unpacked; make it smaller")
+    if not data.strip():
+        raise GridSimError(f"{path}: the file is empty")
+    if b"OSMHeader" in data[:64]:
+        raise GridSimError(f"{path}: a packed map; convert it: osmium cat {path.name} -o {path.name[:-4]}")
+    return data
+
+
+def parse(path: Path, data: bytes) -> Element:
+    """The root of an XML file."""
+    # Nothing that roads are kept in needs a document type; entities in it could grow without limit, or read files.
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data[:64]:
+        raise GridSimError(f"{path}: a map is XML in UTF-8 without a document type or entities")
+    try:
+        return ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        if data.lstrip()[:1] != b"<":
+            raise GridSimError(f"{path}: not a map: it is neither XML nor a picture; there are {FORMATS}") from None
+        raise GridSimError(f"{path}: truncated or damaged XML: {shown(str(error))}") from None
+
+
+def format_of(path: Path, data: bytes, root: Element) -> str:
+    """A file's format: osm, lanelet2, opendrive, sumo or commonroad."""
+    name = re.sub(r"^\{.*\}", "", root.tag)
+    if name == "osm":
+        return "lanelet2" if b"lanelet" in data and _has_lanelets(root) else "osm"
+    known = {"OpenDRIVE": "opendrive", "net": "sumo", "commonRoad": "commonroad"}
+    if name not in known:
+        raise GridSimError(f"{path}: XML of another kind, <{name[:30]}>; there are {FORMATS}")
+    return known[name]
+
+
+def _has_lanelets(root: Element) -> bool:
+    return any(tag.get("k") == "type" and tag.get("v") == "lanelet" for tag in root.iterfind("relation/tag"))

@@ -1,0 +1,153 @@
+"""What every format of real roads is read into: lanes with bounds, and the areas of junctions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+RETURN = 4.0  # m that a line may go back where two lanes meet, because a file's nodes are closer than its junctions
+RETURN_COSINE = -0.2  # of the angle at such a point
+
+
+@dataclass
+class Lane:
+    """A lane for cars; z is 0 where a file knows no heights."""
+
+    left: np.ndarray  # float64 [n, 3], m: its bounds in driving direction, point i of one beside point i of the other
+    right: np.ndarray
+    speed: float = math.nan  # m/s, the limit; nan: unknown
+    successors: list[str] = field(default_factory=list)
+    left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
+    right_lane: str = ""
+    junction: str | None = None  # of the file; "": the lane is outside of junctions; None: the format does not tell
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Middle line float64 [n, 3]."""
+        return (self.left + self.right) / 2
+
+    @property
+    def length(self) -> float:
+        """Length (m) of the middle line."""
+        return float(np.hypot(*np.diff(self.centre[:, :2], axis=0).T).sum())
+
+
+@dataclass
+class RealRoad:
+    """The roads of a file, in its own coordinates (m)."""
+
+    format: str  # its name in words
+    lanes: dict[str, Lane]
+    junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
+    degrees: tuple[
+        float, ...
+    ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
+    notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
+
+    @property
+    def length(self) -> float:
+        """Length (m) of all lanes."""
+        return sum(lane.length for lane in self.lanes.values())
+
+
+def paired(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two bounds with the same number of points, at the shares of their lengths at which either has one."""
+    shares = [_shares(bound) for bound in (left, right)]
+    both = np.unique(np.round(np.concatenate(shares), 9))
+    return tuple(
+        np.column_stack([np.interp(both, at, column) for column in bound.T])
+        for at, bound in zip(shares, (left, right), strict=True)
+    )  # type: ignore[return-value]
+
+
+def _shares(line: np.ndarray) -> np.ndarray:
+    """Arc length at each point of a polyline, as a share of the whole."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    return along / max(along[-1], 1e-9)
+
+
+def without_repeats(line: np.ndarray, least: float = 0.01) -> np.ndarray:
+    """A polyline without points that are nearer to the one before than `least` m; its last point is kept."""
+    kept = [0]
+    for k in range(1, len(line)):
+        if np.hypot(*(line[k, :2] - line[kept[-1], :2])) >= least:
+            kept.append(k)
+    if kept[-1] != len(line) - 1 and len(kept) > 1:
+        kept[-1] = len(line) - 1
+    return line[kept]
+
+
+def bounds_of(centre: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right bounds of a lane with this middle line [n, 3] and width (m)."""
+    step = np.diff(centre[:, :2], axis=0)
+    step /= np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+    before, after = np.vstack([step[:1], step]), np.vstack([step, step[-1:]])
+    along = before + after
+    # At a bend, the bound lies farther out by 1 / cos(half the bend), here at most by half.
+    along /= np.maximum((along * before).sum(axis=1), 2.0 / 1.5 * 0.5)[:, None]
+    aside = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))]) * (width / 2)
+    return centre + aside, centre - aside
+
+
+def part_of(lane: Lane, first: float, last: float) -> Lane:
+    """The part of a lane between two arc lengths (m) along its middle line; without successors."""
+    shares, length = _shares(lane.centre), lane.length
+    a, b = max(first / length, 0.0), min(last / length, 1.0)
+    at = np.concatenate([[a], shares[(shares > a + 1e-6) & (shares < b - 1e-6)], [b]])
+    left, right = (
+        np.column_stack([np.interp(at, shares, column) for column in bound.T]) for bound in (lane.left, lane.right)
+    )
+    return replace(lane, left=left, right=right, successors=[])
+
+
+def joined(one: Lane, other: Lane) -> Lane:
+    """Two lanes, of which one follows the other, as one; with the successors of the second."""
+    left, right = (np.concatenate([a, b[1:]]) for a, b in ((one.left, other.left), (one.right, other.right)))
+    kept = _without_returns((left + right)[:, :2] / 2)
+    speeds = [lane.speed for lane in (one, other) if not math.isnan(lane.speed)]
+    junction = one.junction if one.length > other.length else other.junction
+    speed = (one if one.length > other.length else other).speed if speeds else math.nan
+    successors = list(other.successors)
+    return replace(one, left=left[kept], right=right[kept], speed=speed, successors=successors, junction=junction)
+
+
+def _without_returns(line: np.ndarray) -> list[int]:
+    """Which points of a polyline [n, 2] to keep, so that it does not go back a little and then forth again."""
+    kept: list[int] = []
+    for k in range(len(line)):
+        kept.append(k)
+        while len(kept) > 2:
+            before, after = line[kept[-2]] - line[kept[-3]], line[kept[-1]] - line[kept[-2]]
+            lengths = np.hypot(*before), np.hypot(*after)
+            if min(lengths) > RETURN or before @ after > RETURN_COSINE * lengths[0] * lengths[1]:
+                break
+            del kept[-2]
+    return kept
+
+
+def groups_of(lanes: dict[str, Lane]) -> list[list[str]]:
+    """Lanes side by side, from left to right; each lane is in one group."""
+    found, done = [], set()
+    for key in lanes:
+        first = key
+        seen = {key}
+        while (left := lanes[first].left_lane) in lanes and left not in seen:
+            first = left
+            seen.add(first)
+        if first in done:
+            continue
+        group = [first]
+        while (right := lanes[group[-1]].right_lane) in lanes and right not in group:
+            group.append(right)
+        done.update(group)
+        found.append(group)
+    return found
+
+
+def heading(lane: Lane, at: int) -> np.ndarray:
+    """Direction [2] of a lane's middle line at its first (0) or last (-1) point."""
+    line = lane.centre[:, :2]
+    step = line[-1] - line[-2] if at else line[1] - line[0]
+    return step / max(np.hypot(*step), 1e-9)

@@ -1,0 +1,232 @@
+"""Maps of real roads: from a file to the project's `Map`."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import re
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gridsim.config import TRAFFIC_PACE, SimConfig
+from gridsim.errors import GridSimError
+from gridsim.jit import CACHE_FOLDER, F, freeze
+from gridsim.maps.map import Map
+from gridsim.maps.network import Network, make_network
+from gridsim.maps.raster import HALF_WALL, OUTSIDE
+from gridsim.maps.real import ends, select
+from gridsim.maps.real.area import clearance_of
+from gridsim.maps.real.commonroad import read_commonroad
+from gridsim.maps.real.content import format_of, parse, read_content
+from gridsim.maps.real.description import Lane, RealRoad
+from gridsim.maps.real.lanelet2 import read_lanelet2
+from gridsim.maps.real.shape import network_of, resampled, shaped
+from gridsim.maps.real.sumo import convert, read_net
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
+from gridsim.reading import read_bytes
+
+NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
+MAX_NODES = 1 << 24  # of the field: 4 square km
+SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
+USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
+SLOWEST_LIMIT = 15 / 3.6  # m/s; what is below, no road has: a file has it in a wrong unit
+SPEEDS = 0.35, 0.85  # the interval within which speed counts, as shares of the usual limit
+FASTEST = 27.0  # m/s, of the interval
+
+
+def read_road(path: Path, crop: tuple[float, float, float] | None = None) -> RealRoad:
+    """The roads of a file as it has them, with a crop those in a square: its middle and its side in m.
+
+    The middle is latitude and longitude where the file's places are, else x and y in m.
+    """
+    data = read_content(path)
+    root = parse(path, data)
+    kind = format_of(path, data, root)
+    if kind == "osm":
+        return convert(path, data, kind, root, crop)
+    readers = {"commonroad": read_commonroad, "lanelet2": read_lanelet2, "sumo": read_net}
+    road = readers[kind](root) if kind in readers else convert(path, data, kind, root)
+    if crop is not None:
+        middle = np.array(crop[:2])
+        select.cropped(road, (middle[::-1] - road.degrees[:2]) * road.degrees[2:] if road.degrees else middle, crop[2])
+    return road
+
+
+@dataclass
+class Prepared:
+    """A real road made ready: everything of a map that does not depend on the configuration."""
+
+    format: str
+    notes: list[str]  # of `RealRoad`
+    origin: np.ndarray  # float64 [2], m: the file's coordinates of the map's lower left corner
+    nodes: np.ndarray  # clearance float32 [rows, columns], multiples of a step of the field
+    network: Network  # without `speeds`, `clear` and `room`
+    limits: np.ndarray  # float64 [lanes], m/s
+
+    def save(self, path: Path) -> None:
+        """Write it as arrays, so that reading them runs no code; whole, or not at all."""
+        field = np.clip((self.nodes - FIELD_FLOOR) * FIELD_STEPS + 0.5, 0, 255).astype(np.uint8)
+        lanes = {f"lanes_{name}": array for name, array in self.network._asdict().items()}
+        text = np.array([self.format, *self.notes])
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".new", delete=False) as file:
+            np.savez_compressed(file, text=text, origin=self.origin, field=field, limits=self.limits, **lanes)
+        os.replace(file.name, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Prepared:
+        """Read what `save` wrote. Raises: OSError, ValueError, LookupError or BadZipFile."""
+        with np.load(path, allow_pickle=False) as arrays:
+            name, *notes = (str(line) for line in arrays["text"])
+            nodes = arrays["field"].astype(np.float32) / F(FIELD_STEPS) + F(FIELD_FLOOR)
+            *columns, width, height, hand = (arrays[f"lanes_{key}"] for key in Network._fields)
+            scalars = (np.float32(value.item()) for value in (width, height, hand))
+            network = Network._make([*map(freeze, columns), *scalars])
+            return cls(name, notes, arrays["origin"], nodes, network, arrays["limits"])
+
+
+def hand_of(lanes: dict[str, Lane]) -> float:
+    """The side on which traffic drives: 1 right, -1 left; by where the opposite lanes are."""
+    lines = [resampled(lane, math.ceil(lane.length / 3.0))[0] for lane in lanes.values() if not lane.junction]
+    if not lines:
+        return 1.0
+    points = np.concatenate([(line[1:] + line[:-1]) / 2 for line in lines])
+    steps = np.concatenate([np.diff(line, axis=0) for line in lines])
+    ways = steps / np.maximum(np.hypot(*steps.T), 1e-9)[:, None]
+    one, other = cKDTree(points).query_pairs(9.0, output_type="ndarray").T
+    away = points[other] - points[one]
+    across = ways[one, 0] * away[:, 1] - ways[one, 1] * away[:, 0]
+    beside = ((ways[one] * ways[other]).sum(axis=1) < -0.9) & (abs((away * ways[one]).sum(axis=1)) < 4.0)
+    return -1.0 if np.sign(across[beside & (abs(across) > 1.5)]).sum() < 0.0 else 1.0
+
+
+def prepare(road: RealRoad, gap: float) -> Prepared:
+    """Select what can be driven, and shape it."""
+    if not (read := road.length):
+        raise GridSimError(NO_ROAD)
+    select.without_tight_turns(road)
+    select.on_one_level(road)
+    ends.add_turning_loops(road)
+    road.lanes = select.keep(road.lanes, select.largest_connected(road.lanes))
+    size = None
+    joined = select.largest_joined(road.lanes)
+    if sum(lane.length for lane in joined.values()) < road.length / 2:
+        size = sides_of(road.lanes)
+        ends.join_round_the_world(road, size)
+        joined = select.largest_joined(road.lanes)
+    if not joined:
+        raise GridSimError(NO_ROAD)
+    road.lanes = joined
+    if (cut := read - road.length) > 1.0:
+        road.notes.append(f"{cut / 1000:.1f} of {read / 1000:.1f} km of lanes lead nowhere, or do not join the rest")
+    size = sides_of(road.lanes) if size is None else size
+    points = np.concatenate([lane.centre[:, :2] for lane in road.lanes.values()])
+    low, high = points.min(axis=0), points.max(axis=0)
+    origin = np.round((low + high) / 2 - size / 2, 2)
+    shift = np.append(origin, 0.0)
+    for lane in road.lanes.values():
+        lane.left, lane.right = lane.left - shift, lane.right - shift
+    used = {lane.junction for lane in road.lanes.values()}
+    outlines = [outline - origin for key, outline in road.junctions.items() if key in used]
+    hand = hand_of(road.lanes)
+    lanes, conflicts = shaped(road.lanes, gap, size)
+    nodes = clearance_of(lanes, outlines, size)
+    network = network_of(lanes, conflicts, hand)
+    limits = np.array([lane.speed for lane in lanes.values()])
+    limits[~(limits >= SLOWEST_LIMIT)] = USUAL_LIMIT
+    return Prepared(road.format, road.notes, origin, nodes, network, limits)
+
+
+def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
+    """Sides (m) of the torus for these lanes: powers of two."""
+    points = np.concatenate([bound[:, :2] for lane in lanes.values() for bound in (lane.left, lane.right)])
+    extent = np.maximum(np.ptp(points, axis=0) + 2 * OUTSIDE + 1, SHORTEST_SIDE)
+    sides = 2.0 ** np.ceil(np.log2(extent))
+    if sides.prod() * CELLS_PER_UNIT**2 > MAX_NODES:
+        x, y = points.min(axis=0) + np.ptp(points, axis=0) / 2
+        raise GridSimError(
+            f"a world of {sides[0]:,.0f} m x {sides[1]:,.0f} m (its sides are powers of two) is too large: at most "
+            f"{MAX_NODES / CELLS_PER_UNIT**2:,.0f} square metres; crop it: FILE@X,Y,METRES or FILE@LAT,LON,METRES, "
+            f"2,000 m at most; the middle of its roads is at x {x:.0f} m, y {y:.0f} m"
+        )
+    return sides
+
+
+def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
+    """The map."""
+    network, limits = prepared.network, prepared.limits
+    lengths = (np.diff(network.offsets) - 1) * network.steps
+    order = np.argsort(limits)
+    usual = float(limits[order][np.searchsorted(np.cumsum(lengths[order]), lengths.sum() / 2)])
+    low, high = (min(share * usual, FASTEST * share / SPEEDS[1]) for share in SPEEDS)
+    road = make_road(prepared.nodes, (low, high), 2.0 * HALF_WALL)
+    paces = (limits / usual * TRAFFIC_PACE * (low + high)).astype(np.float32)
+    return Map(name, 0, road, Strips.of(), make_network(network, road, config, paces))
+
+
+def split_crop(name: str) -> tuple[Path, tuple[float, float, float] | None]:
+    """The path of a scenario's name, and its crop: FILE@LAT,LON,METRES or FILE@X,Y,METRES."""
+    found = re.fullmatch(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)", name)
+    try:
+        crop = tuple(map(float, found.groups()[1:])) if found else None
+    except ValueError:
+        crop, found = None, None
+    return Path(found[1] if found else name), crop  # type: ignore[return-value]
+
+
+def load_road(name: str, config: SimConfig) -> Map:
+    """The map of a file of real roads; the same object as long as the file does not change. Raises: GridSimError."""
+    if config.unit < 1.0:
+        raise GridSimError(f"{name}: real roads are for cars of 2.9 m or more, not of {config.vehicle.length:g} m")
+    return load(os.path.abspath(name), file_digest(name), config)
+
+
+def file_digest(name: str) -> str:
+    """SHA-256 of a road's file. Raises: GridSimError if it cannot be read."""
+    return hashlib.sha256(read_bytes(split_crop(name)[0])).hexdigest()
+
+
+@lru_cache(maxsize=4)
+def load(name: str, digest: str, config: SimConfig) -> Map:
+    """The map of a file with this digest."""
+    return map_of(name, prepared(name, digest, gap_of(config)), config)
+
+
+def described(name: str, config: SimConfig) -> Prepared:
+    """What was read of a file."""
+    return prepared(os.path.abspath(name), file_digest(name), gap_of(config))
+
+
+def gap_of(config: SimConfig) -> float:
+    """The distance (m) of lanes' middle lines below which their cars may touch."""
+    return config.vehicle.width + config.traffic.beside
+
+
+def cached(name: str, digest: str, gap: float) -> Path:
+    """Where what is made of a file is kept."""
+    key = hashlib.sha256(f"{digest} {split_crop(name)[1]} {gap}".encode()).hexdigest()[:32]
+    return CACHE_FOLDER / f"road-{key}.npz"
+
+
+def prepared(name: str, digest: str, gap: float) -> Prepared:
+    """What `prepare` makes of a file, from the cache if it is there."""
+    path, crop = split_crop(name)
+    kept = cached(name, digest, gap)
+    try:
+        return Prepared.load(kept)
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
+        pass
+    try:
+        made = prepare(read_road(path, crop), gap)
+    except GridSimError as error:
+        raise GridSimError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
+    with contextlib.suppress(OSError):
+        made.save(kept)
+    return made

@@ -1,0 +1,388 @@
+"""A network from described lanes: whole stretches of road, junction lanes long enough for a car, and conflicts."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from gridsim.jit import freeze, njit
+from gridsim.maps.lanes import FORKS, LANE_STEP
+from gridsim.maps.network import Network
+from gridsim.maps.real.description import Lane, groups_of, joined, part_of
+from gridsim.maps.real.select import on_rings
+
+APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
+LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
+ABREAST = 4.8  # m between lanes side by side, at most
+ACROSS = 100.0  # m, of ways across a junction that are made one lane, at most
+ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
+WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
+NEAR_END = 25.0  # m from a road's end within which what crosses it is part of the junction there
+_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
+ASKEW = 1.0  # m, half the difference of a car's length and width: how much farther a car reaches that is turned
+_SAME = 0.5  # m within which two lanes begin at the same place
+
+
+@njit
+def _near(one, other, width, height, gap):
+    """Whether cars on two polylines [n, 2] may touch: they are within `gap` m, or a bit more where they are askew."""
+    for i in range(len(one) - 1):
+        ux, uy = one[i + 1, 0] - one[i, 0], one[i + 1, 1] - one[i, 1]
+        x, y = one[i, 0] + 0.5 * ux, one[i, 1] + 0.5 * uy
+        for j in range(len(other) - 1):
+            vx, vy = other[j + 1, 0] - other[j, 0], other[j + 1, 1] - other[j, 1]
+            dx, dy = other[j, 0] + 0.5 * vx - x, other[j, 1] + 0.5 * vy - y
+            dx, dy = dx - width * round(dx / width), dy - height * round(dy / height)
+            if abs(dx) < gap + 1.0 and abs(dy) < gap + 1.0:
+                sine = abs(ux * vy - uy * vx) / math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy) + 1e-12)
+                if math.sqrt(dx * dx + dy * dy) < gap + sine * ASKEW:
+                    return True
+    return False
+
+
+@njit
+def _find_conflicts(points, offsets, candidates, width, height, gap):
+    """Which of the candidates, pairs of lanes, conflict: bool [lanes, lanes], symmetric."""
+    cross = np.zeros_like(candidates)
+    for i in range(len(cross)):
+        one = points[offsets[i] : offsets[i + 1]]
+        for j in range(i + 1, len(cross)):
+            if not candidates[i, j]:
+                continue
+            other, k = points[offsets[j] : offsets[j + 1]], 0
+            if math.hypot(one[0, 0] - other[0, 0], one[0, 1] - other[0, 1]) < _SAME:  # only behind their fork
+                while (
+                    k < min(len(one), len(other))
+                    and math.hypot(one[k, 0] - other[k, 0], one[k, 1] - other[k, 1]) < 2.0 * gap
+                ):
+                    k += 1
+            if _near(one[k:], other[k:], width, height, gap):
+                cross[i, j] = cross[j, i] = True
+    return cross
+
+
+class Conflicts:
+    """Which lanes may collide: they come closer than `gap` m, and are not one behind the other or side by side."""
+
+    def __init__(self, lanes: dict[str, Lane], gap: float, size: np.ndarray):
+        self.keys = list(lanes)
+        self.lines = [resampled(lane, max(math.ceil(lane.length / LANE_STEP), 1))[0] for lane in lanes.values()]
+        self.index = {key: k for k, key in enumerate(self.keys)}
+        points = np.concatenate(self.lines).astype(np.float32)
+        offsets = np.concatenate([[0], np.cumsum([len(line) for line in self.lines])]).astype(np.int32)
+        middle, half = boxes_of(points, offsets)
+        apart = abs(_short(middle[:, None] - middle[None], size)) - half[:, None] - half[None]
+        candidates = (apart < gap + ASKEW).all(axis=2)
+        for row in self._related(lanes):
+            candidates[np.ix_(row, row)] = False
+        self.cross = _find_conflicts(points, offsets, candidates, *size, gap)
+        self.gap, self.size = gap, size
+
+    def _related(self, lanes: dict[str, Lane]) -> Iterable[list[int]]:
+        """Sets of lanes that do not conflict with each other."""
+        for group in groups_of(lanes):
+            yield [self.index[key] for key in group]
+        for key, lane in lanes.items():
+            here = self.index[key]
+            for other in (self.index[s] for s in lane.successors):
+                yield [here, other]
+                onward = lanes[self.keys[other]]
+                if onward.length < LEAST + 3.0:
+                    for last in onward.successors:
+                        yield [here, self.index[last]]
+
+    def __contains__(self, key: str) -> bool:
+        return bool(self.cross[self.index[key]].any())
+
+    def zone(self, key: str) -> tuple[float, float]:
+        """From where to where (m) on a lane others come too close to it."""
+        line = self.lines[self.index[key]]
+        others = np.concatenate([self.lines[k] for k in np.flatnonzero(self.cross[self.index[key]])])
+        away = _short(line[:, None] - others[None], self.size)
+        near = np.flatnonzero((np.hypot(away[..., 0], away[..., 1]) < self.gap + ASKEW).any(axis=1))
+        step = np.hypot(*np.diff(line, axis=0).T).mean()
+        return (float(near[0] * step), float(near[-1] * step)) if len(near) else (0.0, 0.0)
+
+
+def _short(offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
+    return offsets - np.round(offsets / size) * size
+
+
+def resampled(lane: Lane, intervals: int) -> tuple[np.ndarray, np.ndarray]:
+    """Equally spaced points of a lane's middle line and half widths there: float64 [intervals + 1, 2], [...]."""
+    line = lane.centre[:, :2]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    half = np.hypot(*(lane.left - lane.right)[:, :2].T) / 2
+    at = np.linspace(0.0, along[-1], intervals + 1)
+    return np.column_stack([np.interp(at, along, column) for column in line.T]), np.interp(at, along, half)
+
+
+def boxes_of(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middles and half sides (m) of lanes' bounding boxes: float64 [lanes, 2] each."""
+    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
+    return (low + high) / 2, (high - low) / 2 + _ROUNDED
+
+
+def predecessors(lanes: dict[str, Lane]) -> dict[str, list[str]]:
+    """The lanes that lead to each lane."""
+    found = defaultdict(list)
+    for key, lane in lanes.items():
+        for other in lane.successors:
+            found[other].append(key)
+    return found
+
+
+def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[str]]) -> list[str] | None:
+    """The lanes that alone continue those of a group, in the same order side by side; None if there are none such."""
+    onward = [lanes[key].successors for key in group]
+    if any(len(keys) != 1 or len(before[keys[0]]) != 1 for keys in onward):
+        return None
+    found = [keys[0] for keys in onward]
+    beside = pairwise(found)
+    alone = not lanes[found[0]].left_lane and not lanes[found[-1]].right_lane
+    fits = alone and all(lanes[a].right_lane == b for a, b in beside) and not set(found) & set(group)
+    return found if fits else None
+
+
+def _merge(lanes: dict[str, Lane], crossed: set[str]) -> None:
+    """Join lanes to whole stretches of road; lanes that others cross only if they are short."""
+    before = predecessors(lanes)
+    for group in groups_of(lanes):
+        while all(key in lanes for key in group):
+            onward = _forward(lanes, group, before)
+            if onward is None:
+                break
+            together = sum(max(lanes[key].length for key in keys) for keys in (group, onward))
+            short = min(lanes[key].length for key in (*group, *onward)) < LEAST
+            if not short and (together > WHOLE or crossed & {*group, *onward}):
+                break
+            for key, other in zip(group, onward, strict=True):
+                lanes[key] = joined(lanes[key], lanes.pop(other))
+                for last in lanes[key].successors:
+                    before[last] = [key if k == other else k for k in before[last]]
+
+
+def _absorb(lanes: dict[str, Lane]) -> None:
+    """Make short lanes part of all that lead to them, or of all that follow them."""
+    before = predecessors(lanes)
+    for key in sorted(lanes, key=lambda name: lanes[name].length):
+        lane, first = lanes[key], before[key]
+        if lane.length > APPROACH or key in lane.successors or not first:
+            continue
+        limit = LEAST / 2 if not all(_is_alone(lanes[k]) for k in (*first, *lane.successors)) else LEAST
+        if lane.length <= APPROACH and all(lanes[p].successors == [key] and _is_alone(lanes[p]) for p in first):
+            limit = APPROACH
+        if lane.length > limit:
+            continue
+        if all(lanes[p].successors == [key] for p in first):
+            for p in first:
+                lanes[p] = joined(lanes[p], lane)
+            for s in lane.successors:
+                before[s] = [p for p in before[s] if p != key] + first
+        elif all(before[s] == [key] for s in lane.successors):
+            for s in lane.successors:
+                lanes[s] = replace(joined(lane, lanes[s]), left_lane=lanes[s].left_lane, right_lane=lanes[s].right_lane)
+                before[s] = list(first)
+            for p in first:
+                lanes[p].successors = [s for s in lanes[p].successors if s != key] + lane.successors
+        else:
+            continue
+        for beside in (lane.left_lane, lane.right_lane):
+            if beside in lanes:
+                other = lanes[beside]
+                other.left_lane = "" if other.left_lane == key else other.left_lane
+                other.right_lane = "" if other.right_lane == key else other.right_lane
+        del lanes[key]
+
+
+def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
+    """Make lanes that follow each other inside of a junction one way across it, on which no car has to wait.
+
+    A lane before a fork becomes one for each branch. In roundabouts cars wait.
+    """
+    before = predecessors(lanes)
+    crossed = {key for key in lanes if key in conflicts}
+    few = {key for key in crossed if conflicts.cross[conflicts.index[key]].sum() <= ROUNDABOUT}
+    crossed -= on_rings({key: [s for s in lanes[key].successors if s in few] for key in few})
+    for key in sorted(crossed, key=lambda name: lanes[name].length):
+        lane = lanes[key]
+        onward = [s for s in lane.successors if s in crossed and s != key]
+        if not before[key] or not onward or any(s in lane.successors for s in before[key]):
+            continue
+        if set(onward) != set(lane.successors) or not _is_alone(lane):
+            continue
+        if lane.length + max(lanes[s].length for s in onward) > ACROSS:
+            continue
+        names = {s: f"{key}>{s}" for s in onward}
+        for s, name in names.items():
+            lanes[name] = replace(joined(lane, lanes[s]), left_lane="", right_lane="")
+            crossed.add(name)
+            before[name] = list(before[key])
+            before[s] = [p for p in before[s] if p != key]
+            for last in lanes[s].successors:
+                before[last].append(name)
+        for p in before[key]:
+            lanes[p].successors = [k for k in lanes[p].successors if k != key] + list(names.values())
+        del lanes[key]
+    for key in [key for key in lanes if not before[key]]:  # nothing leads to them any more
+        for s in lanes.pop(key).successors:
+            before[s] = [p for p in before[s] if p != key]
+
+
+def _group_of(lanes: dict[str, Lane], key: str) -> list[str]:
+    return next(group for group in groups_of(lanes) if key in group)
+
+
+def _is_alone(lane: Lane) -> bool:
+    return not lane.left_lane and not lane.right_lane
+
+
+def _give_tail(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
+    """Make the last `length` m of a road part of the lanes that go on from it, if it is theirs alone."""
+    onward = [(key, s) for key in group for s in lanes[key].successors]
+    if min(lanes[key].length for key in group) < length + LEAST or any(
+        before[s] != [key] or s in group or not _is_alone(lanes[s]) for key, s in onward
+    ):
+        return False
+    for key in group:
+        lane = lanes[key]
+        tail = part_of(lane, lane.length - length, lane.length)
+        for s in lane.successors:
+            lanes[s] = replace(joined(tail, lanes[s]), left_lane="", right_lane="", junction=lanes[s].junction)
+        lanes[key] = replace(part_of(lane, 0.0, lane.length - length), successors=lane.successors)
+    return True
+
+
+def _give_head(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
+    """Make the first `length` m of a road part of the lanes that lead to it, if they lead to it alone."""
+    if min(lanes[key].length for key in group) < length + LEAST or any(
+        lanes[p].successors != [key] or p in group or not _is_alone(lanes[p]) for key in group for p in before[key]
+    ):
+        return False
+    for key in group:
+        lane = lanes[key]
+        head = part_of(lane, 0.0, length)
+        for p in before[key]:
+            lanes[p] = replace(joined(lanes[p], head), successors=[key], junction=lanes[p].junction)
+        lanes[key] = replace(part_of(lane, length, lane.length), successors=lane.successors)
+    return True
+
+
+def _split(lanes: dict[str, Lane], group: list[str], share: float) -> list[str]:
+    """Split the lanes of a group at a share of their length; returns the second part."""
+    names = {key: f"{key}+" for key in group}
+    for key in group:
+        lane = lanes[key]
+        at = share * lane.length
+        onward = replace(part_of(lane, at, lane.length), successors=lane.successors)
+        onward.left_lane, onward.right_lane = names.get(lane.left_lane, ""), names.get(lane.right_lane, "")
+        lanes[names[key]] = onward
+        lanes[key] = replace(part_of(lane, 0.0, at), successors=[names[key]])
+    return list(names.values())
+
+
+def _lengthen(lanes: dict[str, Lane]) -> None:
+    """Give short lanes a piece of the road before or after them."""
+    before = predecessors(lanes)
+    for key in list(lanes):
+        lane = lanes[key]
+        need = LEAST - lane.length
+        if (
+            need > 0.0
+            and not (len(before[key]) == 1 and _give_tail(lanes, before, _group_of(lanes, before[key][0]), need))
+            and len(lane.successors) == 1
+        ):
+            _give_head(lanes, before, _group_of(lanes, lane.successors[0]), need)
+
+
+def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
+    """Make what is crossed of a road part of the junctions at its ends, or a lane of its own."""
+    before = predecessors(lanes)
+    for group in groups_of(lanes):
+        crossed = [key for key in group if key in conflicts]
+        length = min(lanes[key].length for key in group)
+        if not crossed or lanes[group[0]].junction or length < 3 * LEAST:
+            continue
+        zones = [conflicts.zone(key) for key in crossed]
+        first, last = min(zone[0] for zone in zones) - 1.0, max(zone[1] for zone in zones) + 1.0
+        if (
+            last > length - NEAR_END
+            and first > length - 2 * NEAR_END
+            and _give_tail(lanes, before, group, length - first)
+        ):
+            continue
+        if first < NEAR_END and last < 2 * NEAR_END and _give_head(lanes, before, group, last):
+            continue
+        if last < length - LEAST and last > LEAST:
+            _split(lanes, group, last / length)
+            length = last
+        if first > LEAST and first < length - LEAST:
+            _split(lanes, group, first / length)
+
+
+def _unlink(lanes: dict[str, Lane], gap: float) -> None:
+    """Take lanes that run into one another, or apart, for no neighbours."""
+    for group in groups_of(lanes):
+        for left, right in pairwise(group):
+            n = max(math.ceil(lanes[left].length / LANE_STEP), 1)
+            away = resampled(lanes[left], n)[0] - resampled(lanes[right], n)[0]
+            if np.hypot(*away.T).min() < gap or np.hypot(*away.T).max() > ABREAST:
+                lanes[left].right_lane = lanes[right].left_lane = ""
+
+
+def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[str, Lane], Conflicts]:
+    """Lanes as traffic needs them, and which of them may collide; `gap` (m) between middle lines, size of the torus."""
+    lanes = {key: replace(lane, successors=list(lane.successors)) for key, lane in lanes.items()}
+    _unlink(lanes, gap)
+    for _ in range(3):
+        _absorb(lanes)
+        conflicts = Conflicts(lanes, gap, size)
+        _merge(lanes, {key for key in lanes if key in conflicts})
+        conflicts = Conflicts(lanes, gap, size)
+        _contract(lanes, conflicts)
+        _lengthen(lanes)
+        _clear_roads(lanes, Conflicts(lanes, gap, size))
+    return lanes, Conflicts(lanes, gap, size)
+
+
+def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Network:
+    """The network of shaped lanes; without `speeds`, `clear` and `room`."""
+    intervals = {}
+    for group in groups_of(lanes):
+        longest = max(lanes[key].length for key in group)
+        intervals.update(dict.fromkeys(group, max(math.ceil(longest / LANE_STEP - 1e-9), 1)))
+    lines = [resampled(lane, intervals[key])[0] for key, lane in lanes.items()]
+    index = conflicts.index
+    for key, lane in lanes.items():  # where a file leaves a gap, or its bounds do not quite meet
+        for s in lane.successors:
+            away = lines[index[key]][-1] - lines[index[s]][0]
+            lines[index[s]][0] += _short(away, conflicts.size)
+    points = np.concatenate(lines).astype(np.float32)
+    offsets = np.concatenate([[0], np.cumsum([len(line) for line in lines])]).astype(np.int32)
+    lengths = np.array([np.hypot(*np.diff(line, axis=0).T).sum() for line in lines])
+    successors = np.full((len(lanes), max(FORKS, max(len(lane.successors) for lane in lanes.values()))), -1, np.int32)
+    for key, lane in lanes.items():
+        successors[index[key], : len(lane.successors)] = [index[s] for s in lane.successors]
+    cross = conflicts.cross
+    arrays = {
+        "points": points,
+        "speeds": np.zeros(len(points), dtype=np.float32),
+        "offsets": offsets,
+        "steps": (lengths / (np.diff(offsets) - 1)).astype(np.float32),
+        "successors": successors,
+        "left": np.array([index.get(lane.left_lane, -1) for lane in lanes.values()], dtype=np.int32),
+        "right": np.array([index.get(lane.right_lane, -1) for lane in lanes.values()], dtype=np.int32),
+        "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
+        "crossings": np.nonzero(cross)[1].astype(np.int32),
+        "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "room": np.zeros(len(points), dtype=np.float32),
+        "boxes": np.concatenate(boxes_of(points, offsets), axis=1).astype(np.float32),
+    }
+    frozen = {name: freeze(array) for name, array in arrays.items()}
+    width, height = (np.float32(side) for side in conflicts.size)
+    return Network(**frozen, width=width, height=height, hand=np.float32(hand))

@@ -1,0 +1,231 @@
+"""Roads from files: every format gives the same lanes; what cannot be driven goes; traffic; bad files."""
+
+from __future__ import annotations
+
+import gzip
+import pickle
+
+import numpy as np
+import pytest
+from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, osm, street
+
+from gridsim.collision import boxes_touch, collides
+from gridsim.config import SimConfig, constants
+from gridsim.errors import GridSimError
+from gridsim.jit import njit
+from gridsim.maps.real import content, load, sumo
+from gridsim.maps.roads import clearances
+from gridsim.maps.scenarios import build, default_traffic, label
+from gridsim.state import COS, LANE, SHIFT, SIN, SPEED, X, Y
+from gridsim.traffic.behaviour import drivers, step_traffic
+from gridsim.traffic.world import spawn
+
+SIM = SimConfig()
+CROSSING = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0)), street((0.0, -120.0), (0.0, 0.0), (0.0, 120.0))]
+
+
+def written(folder, name, text):
+    path = folder / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return str(path)
+
+
+def centres(path):
+    """Ends of the lanes' middle lines [lanes, 4], in order, with the road's middle at 0."""
+    lanes = load.read_road(load.Path(path)).lanes.values()
+    ends = np.array([[lane.centre[0, :2], lane.centre[-1, :2]] for lane in lanes])
+    ends -= ends.reshape(-1, 2).mean(axis=0)
+    return ends[np.argsort(ends[:, 0, 0])].reshape(-1, 4), [lane.speed for lane in lanes]
+
+
+def test_formats_give_the_same_lanes(tmp_path):
+    files = {
+        "a.osm": osm([street((0.0, 0.0), (200.0, 0.0))]),
+        "b.xodr": opendrive(200.0),
+        "c.xml": commonroad(both_ways(200.0)),
+        "d.osm": lanelet2(both_ways(200.0)),
+    }
+    expected = np.array([[-100.0, -1.6, 100.0, -1.6], [100.0, 1.6, -100.0, 1.6]])
+    for name, text in files.items():
+        lanes, speeds = centres(written(tmp_path, name, text))
+        assert np.abs(lanes - expected).max() < 0.2, name
+        assert speeds == pytest.approx([50 / 3.6] * 2, abs=0.02), name
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "hand"),
+    [
+        ("a.osm", osm([street((0.0, 0.0), (200.0, 0.0))]), 1.0),
+        ("b.osm", osm([street((0.0, 0.0), (200.0, 0.0))], BRITAIN), -1.0),
+        ("c.xodr", opendrive(200.0, "LHT"), -1.0),
+        ("d.xml", commonroad(both_ways(200.0, -1.0)), -1.0),
+    ],
+)
+def test_side_of_the_road(tmp_path, name, text, hand):
+    here = build(written(tmp_path, name, text), 0)
+    assert here.network.hand == hand
+    # A lane's room is on its side of the road, where it was measured: beyond it, there is no more.
+    points, k = here.network.points, np.argmax(here.network.room)
+    along = points[k + 1] - points[k]
+    outward = hand * np.array([along[1], -along[0]]) / np.hypot(*along)
+    clear = clearances(here.road, np.stack([points[k], points[k] + here.network.room[k] * outward]).astype(np.float32))
+    assert clear[1] < clear[0]
+
+
+def mirrored(worlds, width):
+    """Worlds in a mirror across x."""
+    worlds = worlds.copy()
+    worlds[..., X] = np.mod(width - worlds[..., X], width)
+    worlds[..., COS] *= -1.0
+    worlds[..., SHIFT] *= -1.0
+    return worlds
+
+
+def test_left_hand_traffic_is_a_mirror_image(tmp_path):
+    """Also where it gives way to an ego car that comes along the middle of the road."""
+    right = build(written(tmp_path, "right.xml", commonroad(both_ways(200.0))), 0)
+    flipped = [([(-x, y) for x, y in b], [(-x, y) for x, y in a]) for a, b in both_ways(200.0)]
+    left = build(written(tmp_path, "left.xml", commonroad(flipped)), 0)
+    assert [float(here.network.hand) for here in (right, left)] == [1.0, -1.0]
+    # In the turning loops, the pixels of the edges differ.
+    assert np.percentile(np.abs(right.network.room - left.network.room), 70) < 0.02
+    width = float(right.road.width)
+    start = np.full((1, 5), 1e6, dtype=np.float32)
+    worlds = [spawn(here.network, start, 6, np.array([3], dtype=np.uint64), SIM)[0] for here in (right, left)]
+    ego = np.zeros(8, dtype=np.float32)
+    ego[[X, Y, COS]] = width / 2, float(right.road.height) / 2, 1.0
+    egos, moved = [ego, mirrored(np.append(ego, np.zeros(13, np.float32)), width)[:8]], 0.0
+    for _ in range(300):
+        for here, world, car in zip((right, left), worlds, egos, strict=True):
+            drive(here.road, here.network, drivers(SIM), constants(SIM), world, car, 1)
+        moved = max(moved, float(np.abs(worlds[0][:, SHIFT]).max()))
+    assert moved > 0.15
+    assert np.abs(mirrored(worlds[1], width)[:, [X, Y, SPEED, SHIFT]] - worlds[0][:, [X, Y, SPEED, SHIFT]]).max() < 0.1
+
+
+@njit
+def drive(road, network, drivers, constants, world, ego, steps):
+    """Overlaps of cars, and cars off the road, in so many steps; and the most steps for which all cars stood."""
+    overlaps, off, stood, longest = 0, 0, 0, 0
+    for _ in range(steps):
+        step_traffic(network, drivers, world, ego)
+        stood = 0 if (world[:, SPEED] > 0.1).any() else stood + 1
+        longest = max(longest, stood)
+        for i in range(len(world)):
+            car = world[i]
+            off += car[LANE] >= 0.0 and collides(road, constants, car[X], car[Y], car[COS], car[SIN])
+            for j in range(i):
+                dx, dy = world[j, X] - car[X], world[j, Y] - car[Y]
+                if min(car[LANE], world[j, LANE]) >= 0.0 and abs(dx) + abs(dy) < 9.0:
+                    overlaps += boxes_touch(constants, dx, dy, car[COS], car[SIN], world[j, COS], world[j, SIN])
+    return overlaps, off, longest
+
+
+def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
+    """Its four roads end: a loop each; 12 cars for ten minutes."""
+    name = written(tmp_path, "crossing.osm", osm(CROSSING))
+    here = build(name, 0)
+    assert "4 roads that end got a turning loop" in load.described(name, SIM).notes
+    world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 12, np.zeros(1, np.uint64), SIM)[0]
+    assert (world[:, LANE] >= 0).sum() >= 10
+    nobody = np.array([np.inf, 0, 0, 0, 0, 0, 0, 0], dtype=np.float32)
+    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, nobody, 6000)
+    assert (overlaps, off) == (0, 0)
+    assert stood < 600
+
+
+def test_lanes_join_and_lie_on_the_road(tmp_path):
+    here = build(written(tmp_path, "crossing.osm", osm(CROSSING)), 0)
+    n = here.network
+    last, first = n.points[n.offsets[1:] - 1], n.points[n.offsets[:-1]]
+    for lane, onward in enumerate(n.successors):
+        assert (onward >= 0).any()
+        for other in onward[onward >= 0]:
+            assert np.abs(here.shortest(first[other] - last[lane])).max() < 0.01
+    assert clearances(here.road, n.points).min() > 1.0
+    assert (n.steps <= 1.0).all()
+    assert pickle.loads(pickle.dumps(here)).network.points.tobytes() == n.points.tobytes()
+
+
+def test_way_under_a_bridge_is_left_out(tmp_path):
+    under = street((0.0, -120.0), (0.0, 120.0))
+    over = street((-120.0, 0.0), (-60.0, 0.0), (60.0, 0.0), (120.0, 0.0), bridge="yes", layer="1")
+    found = load.described(written(tmp_path, "bridge.osm", osm([under, over])), SIM)
+    assert any("under bridges" in note for note in found.notes)
+    points = found.network.points
+    assert np.ptp(points[:, 0]) > 200.0 > np.ptp(points[:, 1])
+
+
+def test_sharp_turns_are_no_ways_of_traffic(tmp_path):
+    turn = [[(200.0, 0.0), (201.0, 0.0), (200.0, 0.1)], [(200.0, -3.2), (204.0, 1.6), (200.0, 3.2)]]
+    lanes = [*both_ways(200.0), (turn[0], turn[1])]
+    found = load.described(written(tmp_path, "turn.xml", commonroad(lanes, {1: [3], 3: [2]})), SIM)
+    assert any("turn in less than 3.5 m" in note for note in found.notes)
+
+
+def test_cache_gives_the_same_map_without_netconvert(tmp_path, monkeypatch):
+    name = written(tmp_path, "a 'street'.osm", osm([street((0.0, 0.0), (200.0, 0.0))]))
+    first = build(name, 0)
+    load.load.cache_clear()
+    monkeypatch.setattr(sumo, "_netconvert", None)
+    again = build(name, 0)
+    assert again is not first
+    assert pickle.dumps(again.network) == pickle.dumps(first.network)
+    assert np.array_equal(again.road.field, first.road.field)
+    assert (label(name), default_traffic(name)) == ("a 'street'", 8)
+
+
+def test_crop(tmp_path):
+    ways = [*CROSSING, street((120.0, 0.0), (400.0, 0.0))]
+    name = written(tmp_path, "long.osm", osm(ways))
+    whole, part = build(name, 0), build(f"{name}@50.0,9.0,200", 0)
+    assert part.mileage[-1] < 0.8 * whole.mileage[-1]
+    with pytest.raises(GridSimError, match="No edges"):
+        build(f"{name}@51.0,9.0,200", 0)
+
+
+BOMB = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "cc"><!ENTITY d "&b;&b;">]><osm>&d;</osm>'
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "says"),
+    [
+        ("a.osm", b"", "empty"),
+        ("b.osm", osm(CROSSING)[:400], "truncated"),
+        ("c.osm", BOMB, "entities"),
+        ("d.xml", "<svg/>", "another kind"),
+        ("e.xodr", "hello", "neither XML"),
+        ("f.osm", osm([street((0.0, 0.0), (200.0, 0.0), highway="footway")]), "no road|netconvert failed"),
+        ("g.osm.gz", gzip.compress(b"<osm>" + b" " * 3000, mtime=0), "when unpacked"),
+        ("h.osm.gz", gzip.compress(b"<osm>" + b" " * 300, mtime=0)[:20], "damaged"),
+        ("i.osm", "<osm></osm>", "no nodes"),
+        ("j.xml", commonroad([]), "no road"),
+        ("k.net.xml", "<net></net>", "no road"),
+    ],
+)
+def test_bad_files(tmp_path, monkeypatch, name, data, says):
+    monkeypatch.setattr(content, "MAX_BYTES", 2000)
+    path = written(tmp_path, name, data)
+    with pytest.raises(GridSimError, match=says) as error:
+        build(path, 0)
+    assert str(error.value).startswith(path)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_without_sumo_the_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "find_spec", lambda name: None)
+    with pytest.raises(GridSimError, match=r"pip install 'gridsim\[roads\]'"):
+        build(written(tmp_path, "a.osm", osm([street((0.0, 0.0), (201.0, 0.0))])), 0)
+
+
+def test_map_command(tmp_path, capsys, monkeypatch):
+    from cluster.commands import roads
+
+    name = written(tmp_path, "crossing.osm", osm(CROSSING))
+    monkeypatch.setattr("sys.argv", ["gridsim-map", name, "--output", str(tmp_path / "a.png")])
+    with pytest.raises(SystemExit) as ended:
+        roads.map_main()
+    printed = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert "1 junctions, traffic keeps right" in printed
+    assert (tmp_path / "a.png").stat().st_size > 5000

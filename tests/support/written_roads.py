@@ -1,0 +1,105 @@
+"""Small roads written in each format, in metres around a point of the middle meridian of a UTM zone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+GERMANY, BRITAIN = (50.0, 9.0), (52.0, -3.0)
+HALF = 1.6  # m, half the width of a lane
+
+
+def osm(
+    ways: Sequence[tuple[Sequence[tuple[float, float]], dict[str, str]]], place: tuple[float, float] = GERMANY
+) -> str:
+    """Ways of points (m) with their tags; points that are the same are one node."""
+    north, east = 111_240.0, 111_320.0 * math.cos(math.radians(place[0])) * 1.00196
+    numbers: dict[tuple[float, float], int] = {}
+    for points, _ in ways:
+        for point in points:
+            numbers.setdefault(point, len(numbers) + 1)
+    nodes = "".join(
+        f'<node id="{n}" lat="{place[0] + y / north:.9f}" lon="{place[1] + x / east:.9f}" version="1"/>'
+        for (x, y), n in numbers.items()
+    )
+    text = ""
+    for k, (points, tags) in enumerate(ways):
+        refs = "".join(f'<nd ref="{numbers[point]}"/>' for point in points)
+        values = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        text += f'<way id="{100 + k}" version="1">{refs}{values}</way>'
+    return f'<?xml version="1.0"?><osm version="0.6">{nodes}{text}</osm>'
+
+
+def street(*points: tuple[float, float], **tags: str) -> tuple[Sequence[tuple[float, float]], dict[str, str]]:
+    """A way of two lanes."""
+    return points, {"highway": "residential", "lanes": "2", "maxspeed": "50", **tags}
+
+
+def opendrive(length: float, rule: str = "RHT") -> str:
+    """A straight road along x, of one lane each way."""
+    lanes = "".join(
+        f'<{side}><lane id="{k}" type="driving" level="false"><width sOffset="0" a="{2 * HALF}" b="0" c="0" d="0"/>'
+        f"</lane></{side}>"
+        for side, k in (("left", 1), ("right", -1))
+    )
+    middle = '<center><lane id="0" type="none" level="false"/></center>'
+    left, right = lanes.split("</left>")
+    return (
+        '<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4" name="" version="1.00"/>'
+        f'<road name="" length="{length}" id="1" junction="-1" rule="{rule}"><link/>'
+        '<type s="0" type="town"><speed max="50" unit="km/h"/></type>'
+        f'<planView><geometry s="0" x="0" y="0" hdg="0" length="{length}"><line/></geometry></planView>'
+        f'<lanes><laneSection s="0">{left}</left>{middle}{right}</laneSection></lanes></road></OpenDRIVE>'
+    )
+
+
+Bounds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
+
+
+def both_ways(length: float, hand: float = 1.0) -> list[Bounds]:
+    """Left and right bounds of the lanes of a straight road along x; `hand` 1: traffic keeps right."""
+    w = 2 * HALF * hand
+    there = [(0.0, 0.0), (length, 0.0)], [(0.0, -w), (length, -w)]
+    back = [(length, 0.0), (0.0, 0.0)], [(length, w), (0.0, w)]
+    return [there, back] if hand > 0 else [there[::-1], back[::-1]]
+
+
+def commonroad(lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None) -> str:
+    """Lanelets, numbered from 1, with their successors."""
+
+    def bound(name: str, points: Sequence[tuple[float, float]]) -> str:
+        return f"<{name}>" + "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in points) + f"</{name}>"
+
+    text = ""
+    for k, (left, right) in enumerate(lanes, 1):
+        after = "".join(f'<successor ref="{s}"/>' for s in (successors or {}).get(k, ()))
+        sign = '<trafficSignRef ref="900"/>'
+        text += f'<lanelet id="{k}">{bound("leftBound", left)}{bound("rightBound", right)}{after}{sign}</lanelet>'
+    element = "<trafficSignID>274</trafficSignID><additionalValue>13.89</additionalValue>"
+    signs = f'<trafficSign id="900"><trafficSignElement>{element}</trafficSignElement></trafficSign>'
+    return (
+        f'<?xml version="1.0"?><commonRoad commonRoadVersion="2020a" benchmarkID="ZAM_A-1">{text}{signs}</commonRoad>'
+    )
+
+
+def lanelet2(lanes: Sequence[Bounds]) -> str:
+    """Lanelets with nodes in local metres."""
+    numbers: dict[tuple[float, float], int] = {}
+    for bounds in lanes:
+        for point in (*bounds[0], *bounds[1]):
+            numbers.setdefault(point, len(numbers) + 1)
+    text = "".join(
+        f'<node id="{n}" lat="" lon=""><tag k="local_x" v="{x}"/><tag k="local_y" v="{y}"/></node>'
+        for (x, y), n in numbers.items()
+    )
+    relations = ""
+    for k, bounds in enumerate(lanes):
+        members = ""
+        for role, number, points in zip(("left", "right"), (1000 + 10 * k, 1001 + 10 * k), bounds, strict=True):
+            refs = "".join(f'<nd ref="{numbers[point]}"/>' for point in points)
+            text += f'<way id="{number}">{refs}</way>'
+            members += f'<member type="way" ref="{number}" role="{role}"/>'
+        tags = {"type": "lanelet", "subtype": "road", "speed_limit": "50"}
+        values = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        relations += f'<relation id="{5000 + k}">{members}{values}</relation>'
+    return f'<?xml version="1.0"?><osm>{text}{relations}</osm>'
