@@ -89,7 +89,7 @@ def _actions(packed, layers, constants, ranges, speeds, actions):
     for i in range(len(actions)):
         encode(constants, ranges[i], None, speeds[i], np.float32(0.0), scratch)
         normalise(constants, ranges.shape[1], ranges.shape[1], scratch)
-        actions[i] = decide(packed, layers, scratch)
+        actions[i] = decide(packed, layers, scratch, None)
 
 
 def vector_env(

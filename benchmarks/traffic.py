@@ -31,7 +31,7 @@ import time
 
 import numpy as np
 
-from gridsim.car.collision import boxes_touch, collides
+from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import sample_starts

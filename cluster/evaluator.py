@@ -15,7 +15,7 @@ from cluster.workers.pool import Outcome
 from cluster.workers.worker import Task
 from evolution.episodes import fitness
 from evolution.episodes.starts import Episodes, lane_starts
-from evolution.networks.policy import PolicySpec
+from evolution.networks.policy import Actions, PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
@@ -45,6 +45,7 @@ class Evaluator:
         workers: int = 0,
         address: str | None = None,
         episodes: int = 16,
+        actions: Actions = "discrete",
     ):
         """Open the pool of workers, which `close`, or the end of a `with`, ends.
 
@@ -56,12 +57,15 @@ class Evaluator:
                 and time limit make an evaluation shorter.
             workers, address: Ray workers, and a cluster's address; by default this process's threads.
             episodes: that each genome drives.
+            actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
 
         Raises: GridSimError, a ValueError, in one line.
         """
-        observation = PolicySpec.parse(policy).observation if policy else "rays"
         given: dict[str, Any] = {"sim": sim} if isinstance(sim, str) else {}
-        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, observation=observation, **given)
+        if policy:
+            spec = PolicySpec.parse(policy)
+            given["observation"], actions = spec.observation, spec.actions if spec.suffix else actions
+        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, actions=actions, **given)
         settings.check()
         check_workers(workers, 0.0)
         if not 1 <= episodes <= MAX_EPISODES:

@@ -14,11 +14,19 @@ import tyro
 from cluster import fitness
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.episodes.rollout import policy_buffers
-from evolution.networks.policy import Observation, PolicySpec
+from evolution.networks.policy import CONTINUOUS, Actions, Observation, PolicySpec
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import build, check_name, default_traffic, has_lanes, is_map_file, speed_interval
+from gridsim.maps.scenarios import (
+    REGISTRY,
+    build,
+    check_name,
+    default_traffic,
+    has_lanes,
+    is_map_file,
+    speed_interval,
+)
 from gridsim.step import parameters
 from gridsim.traffic.world import check_traffic
 
@@ -28,6 +36,8 @@ LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
+
+ROADS = f"{', '.join(REGISTRY)}, or a map file (docs/maps.md)."
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -41,8 +51,7 @@ class RunSettings(ABC):
     step_name: ClassVar[str]  # what a step of learning is called
     verb: ClassVar[str]  # what is done to a network
 
-    scenario: str = "seamless"
-    """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
+    scenario: Annotated[str, tyro.conf.arg(help=f"Road to learn on: {ROADS}")] = "seamless"
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
     sim: str = "default"
@@ -166,6 +175,8 @@ class EvolveSettings(RunSettings):
     +steering to see its own steering angle; by default mlp:64+steering, in traffic
     mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
     of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    actions: Actions = "discrete"
+    """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
     """Members of a generation; by default 256, in traffic 128, where each drives more episodes."""
     generations: Annotated[int, IN_WORDS] = 0
@@ -190,6 +201,8 @@ class EvolveSettings(RunSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "fitness", fitness.absolute(self.fitness))
+        if self.actions == "continuous":  # the policy's text says it wherever a network goes
+            object.__setattr__(self, "policy", self.policy.removesuffix(CONTINUOUS) + CONTINUOUS)
 
     def defaults(self) -> dict[str, Any]:
         alone = not self.traffic
@@ -229,6 +242,8 @@ class EvolveSettings(RunSettings):
 
     def check(self) -> None:
         super().check()
+        if PolicySpec.parse(self.policy).actions != self.actions:
+            raise GridSimError(f"policy {self.policy} sets pedal and wheel; give --actions continuous, too")
         self._check_range(0, MAX_STEPS, "generations")
         self._check_range(4, 1_000_000, "population")
         self._check_range(0, 1, "mutation_rate")
@@ -307,6 +322,8 @@ class DqnSettings(RunSettings):
 
     def check(self) -> None:
         super().check()
+        if PolicySpec.parse(self.policy).actions == "continuous":
+            raise GridSimError(f"policy {self.policy}: the DQN chooses among the eight actions; leave out {CONTINUOUS}")
         self._check_range(1, MAX_STEPS, "evaluate_every", "batch", "anneal", "target_period")
         self._check_range(0, MAX_STEPS, "episodes")
         self._check_range(0, 1, "discount", "epsilon", "converged")

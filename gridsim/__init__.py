@@ -3,18 +3,19 @@
 Importing it registers the Gymnasium environments. That takes milliseconds, because Numba and the maps are loaded only
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 
-`gridsim.evolve` and the other names of `cluster.api` are loaded from there on first use: users look for them here, but
-the simulator must not import what trains in it.
+`gridsim.SimConfig`, and `gridsim.evolve` and the other names of `cluster.api`, are loaded on first use: users look for
+them here, but the simulator must not import what trains in it.
 """
 
 from importlib import import_module as _import_module
+from pathlib import Path as _Path
+from pkgutil import iter_modules as _iter_modules
 from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
-from gridsim.config import SimConfig as SimConfig
-
-ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in ("highway", "curved", "seamless", "roundabout", "city")}
+_GENERATORS = str(_Path(__file__).parent / "maps" / "generators")
+ENVIRONMENTS = {f"GridSim/{file.name.title()}-v0": file.name for file in _iter_modules([_GENERATORS])}
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"
@@ -40,6 +41,8 @@ for _id, _scenario in ENVIRONMENTS.items():
 
 
 def __getattr__(name: str) -> _Any:
+    if name == "SimConfig":
+        return _import_module("gridsim.config").SimConfig
     if name in _API:
         _import_module("gridsim.packages").check_packages()
         return getattr(_import_module(_API_MODULE), name)
@@ -47,4 +50,4 @@ def __getattr__(name: str) -> _Any:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_API]
+    return [*globals(), "SimConfig", *_API]

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from gridsim.car.models import MODELS, Numbers
 from gridsim.errors import GridSimError
-from gridsim.reading import number, read_yaml, shown
+from gridsim.reading import limits_of, number, quantity, read_yaml, shown
 
 _F = np.float32
 
@@ -23,11 +24,6 @@ FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; 
 # In units (`SimConfig.unit`), which are metres but for small cars.
 SUBSTEP = _F(1.0)  # a car moves between collision checks, at most
 REENTRY = _F(12.0)  # driven; returning to a cell within this distance still counts as the same visit
-
-# The reward of Trasnea et al. (2019).
-PROGRESS_SHARE = 0.15  # weight of the distance, and also of the speed
-CLEARANCE_SHARE = 0.7  # weight of the shortest ray
-CRASH_REWARD = -1.0
 
 # Lanes. Own choices, unless a source is named.
 CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
@@ -66,56 +62,54 @@ EGO_SECTOR_COSINE = _F(0.6)  # of the angle from the ego car's heading within wh
 
 
 @dataclass(frozen=True)
-class VehicleConfig:
-    """The car: its size, and the limits of engine, brakes, steering and tyres."""
+class _Vehicle:
+    """What all models of a vehicle may read."""
 
-    length: float = 4.0  # m
-    width: float = 2.0  # m
-    wheelbase: float = 2.5  # m
-    rear_axle: float = 1.25  # m, centre of mass to rear axle (l_r of Kong et al. 2015)
-    steering_limit: float = 27.0  # degrees either side
-    steering_rate: float = 60.0  # degrees/s, towards the commanded angle and back to the centre
-    speed_limit: float = 30.0  # m/s forward
-    reverse_limit: float = 3.0  # m/s backward
-    acceleration: float = 3.0  # m/s2, forward and in reverse
-    braking: float = 8.0  # m/s2
+    length: float = quantity(4.0, 0.2, 30.0, "m")
+    width: float = quantity(2.0, 0.1, 5.0, "m")
+    wheelbase: float = quantity(2.5, 0.1, 25.0, "m")
+    rear_axle: float = quantity(1.25, 0.05, 25.0, "m")  # centre of mass to rear axle (l_r of Kong et al. 2015)
+    steering_limit: float = quantity(27.0, 1.0, 80.0, "degrees")  # either side
+    steering_rate: float = quantity(60.0, 1.0, 1e5, "degrees/s")  # also back to the centre
+    speed_limit: float = quantity(30.0, 0.5, 150.0, "m/s")  # forward
+    reverse_limit: float = quantity(3.0, 0.0, 50.0, "m/s")  # backward
+    acceleration: float = quantity(3.0, 0.1, 50.0, "m/s2")  # forward and in reverse
+    braking: float = quantity(8.0, 0.1, 50.0, "m/s2")
     # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking it is 9.4:
     # less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
-    lateral_grip: float = 4.9
-    # kinematic or single_track. The numbers that follow are for the latter, whose tyres are linear and do not know
-    # `lateral_grip`; they are those of CommonRoad's vehicle 2, a BMW 320i (Althoff et al. 2017).
-    model: str = "kinematic"
-    mass: float = 1093.3  # kg
-    yaw_inertia: float = 1791.6  # kg m2
-    mass_height: float = 0.6137  # m, of the centre of mass
-    friction: float = 1.0489  # of tyres and road
-    cornering_stiffness: float = 20.898  # 1/rad, of an axle, per load
-    latency: float = 0.0  # s by which commands are late
+    lateral_grip: float = quantity(4.9, 0.1, math.inf, "m/s2")
+    model: str = "kinematic"  # of `car.models.MODELS`
+    latency: float = quantity(0.0, 0.0, 2.0, "s")  # by which commands are late
+
+
+@dataclass(frozen=True)
+class VehicleConfig(Numbers, _Vehicle):
+    """The car: its size, the limits of engine, brakes, steering and tyres, and what only some models of it read."""
 
 
 @dataclass(frozen=True)
 class SensorConfig:
     """The simulated range sensor at the middle of the front axle."""
 
-    rays: int = 31
-    field_of_view: float = 120.0  # degrees, centred on the heading
-    range: float = 50.0  # m; readings are ranges / range, in [0, 1]
-    noise: float = 0.0  # m, standard deviation of a reading
-    noise_share: float = 0.0  # the same, as a share of the range
-    dropout: float = 0.0  # share of readings that are the full range, whatever is there
-    latency: float = 0.0  # s by which readings are late
+    rays: int = quantity(31, 2, 256)
+    field_of_view: float = quantity(120.0, 1.0, 240.0, "degrees")  # centred on the heading
+    range: float = quantity(50.0, 1.0, 63.0, "m")  # readings are ranges / range, in [0, 1]
+    noise: float = quantity(0.0, 0.0, 10.0, "m")  # standard deviation of a reading
+    noise_share: float = quantity(0.0, 0.0, 1.0)  # the same, as a share of the range
+    dropout: float = quantity(0.0, 0.0, 1.0)  # share of readings that are the full range, whatever is there
+    latency: float = quantity(0.0, 0.0, 2.0, "s")  # by which readings are late
 
 
 @dataclass(frozen=True)
 class EpisodeConfig:
     """When an episode ends, and what counts as distance."""
 
-    control_period: float = 0.1  # s
-    target: float = 2000.0  # m of new ground: success
-    time_limit: float = 400.0  # s
-    patience: float = 1.5  # s without progress that end an episode (the paper's sanity check)
-    progress: float = 0.5  # m/s of new ground; a control step with less is without progress
-    revisit: float = 200.0  # m of driving within which the same ground does not count again
+    control_period: float = quantity(0.1, 0.005, 1.0, "s")
+    target: float = quantity(2000.0, 0.1, 1e6, "m")  # of new ground: success
+    time_limit: float = quantity(400.0, 0.1, 1e5, "s")
+    patience: float = quantity(1.5, 0.01, 1e6, "s")  # idle, which end an episode (the paper's sanity check)
+    progress: float = quantity(0.5, 0.0, 100.0, "m/s")  # of new ground; less is idle
+    revisit: float = quantity(200.0, 0.0, 1e6, "m")  # driven before the same ground counts again
 
     @property
     def steps(self) -> int:
@@ -127,54 +121,32 @@ class EpisodeConfig:
 class TrafficConfig:
     """How other cars drive: IDM (Treiber et al. 2000, city values) and MOBIL (Kesting et al. 2007)."""
 
-    acceleration: float = 2.0  # m/s2, a of IDM
-    comfort: float = 2.0  # m/s2, comfortable deceleration, b of IDM
-    braking: float = 8.0  # m/s2, greatest deceleration
-    headway: float = 1.2  # s, T of IDM
-    jam: float = 2.0  # m, bumper to bumper at standstill, s0 of IDM
-    lateral: float = 3.0  # m/s2, lateral acceleration in bends
-    politeness: float = 0.2  # p of MOBIL
-    threshold: float = 0.2  # m/s2 that a lane change must gain
-    safe_braking: float = 3.0  # m/s2 of braking that a lane change may force on the car behind
-    lane_change_speed: float = 1.25  # m/s sideways, at most
-    verge: float = 0.3  # m, least distance from the road's edge to the side of a car that has moved to the right
-    give_way: float = 0.9  # m that a car moves to the right for oncoming cars, at most
-    taper: float = 0.1  # m to the right per m driven while giving way
-    beside: float = 0.35  # m between the sides of cars on crossing lanes, below which they may touch
-    spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
-    spawn_gap_ego: float = 22.0  # m between a car and the ego car at the start, at least
-    courtesy: float = 10.0  # m; waiting behind a standing car within this distance is not idleness
+    acceleration: float = quantity(2.0, 1e-6, 50.0, "m/s2")  # a of IDM
+    comfort: float = quantity(2.0, 0.1, 50.0, "m/s2")  # comfortable deceleration, b of IDM
+    braking: float = quantity(8.0, 1e-6, 50.0, "m/s2")  # greatest deceleration
+    headway: float = quantity(1.2, 0.0, 100.0, "s")  # T of IDM
+    jam: float = quantity(2.0, 0.1, 100.0, "m")  # bumper to bumper at standstill, s0 of IDM
+    lateral: float = quantity(3.0, 0.1, 50.0, "m/s2")  # lateral acceleration in bends
+    politeness: float = quantity(0.2, 0.0, 10.0)  # p of MOBIL
+    threshold: float = quantity(0.2, 0.0, 50.0, "m/s2")  # that a lane change must gain
+    safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # of braking that a lane change may force on the car behind
+    lane_change_speed: float = quantity(1.25, 0.1, 10.0, "m/s")  # sideways, at most
+    verge: float = quantity(0.3, 0.0, 10.0, "m")  # from the road's edge to a car that has moved to the right, at least
+    give_way: float = quantity(0.9, 0.0, 10.0, "m")  # to the right for oncoming cars, at most
+    taper: float = quantity(0.1, 0.001, 1.0)  # m to the right per m driven while giving way
+    beside: float = quantity(0.35, 0.0, 10.0, "m")  # between the sides of cars on crossing lanes, at least
+    spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars at the start of an episode, at least
+    spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # between a car and the ego car at the start, at least
+    courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind a car that stands this close is not idle
 
 
-# Limits of each number: least, greatest, unit.
-LIMITS: dict[str, dict[str, tuple[float, float, str]]] = {
-    "vehicle": {
-        "length": (0.2, 30.0, "m"), "width": (0.1, 5.0, "m"), "wheelbase": (0.1, 25.0, "m"),
-        "rear_axle": (0.05, 25.0, "m"), "steering_limit": (1.0, 80.0, "degrees"),
-        "steering_rate": (1.0, 1e5, "degrees/s"), "speed_limit": (0.5, 150.0, "m/s"),
-        "reverse_limit": (0.0, 50.0, "m/s"), "acceleration": (0.1, 50.0, "m/s2"), "braking": (0.1, 50.0, "m/s2"),
-        "lateral_grip": (0.1, math.inf, "m/s2"), "mass": (0.1, 1e5, "kg"), "yaw_inertia": (1e-4, 1e7, "kg m2"),
-        "mass_height": (0.001, 5.0, "m"), "friction": (0.05, 3.0, ""), "cornering_stiffness": (0.5, 200.0, "1/rad"),
-        "latency": (0.0, 2.0, "s"),
-    },
-    "sensors": {
-        "rays": (2, 256, ""), "field_of_view": (1.0, 240.0, "degrees"), "range": (1.0, 63.0, "m"),
-        "noise": (0.0, 10.0, "m"), "noise_share": (0.0, 1.0, ""), "dropout": (0.0, 1.0, ""),
-        "latency": (0.0, 2.0, "s"),
-    },
-    "episode": {
-        "control_period": (0.005, 1.0, "s"), "target": (0.1, 1e6, "m"), "time_limit": (0.1, 1e5, "s"),
-        "patience": (0.01, 1e6, "s"), "progress": (0.0, 100.0, "m/s"), "revisit": (0.0, 1e6, "m"),
-    },
-    "traffic": {
-        "acceleration": (1e-6, 50.0, "m/s2"), "comfort": (0.1, 50.0, "m/s2"), "braking": (1e-6, 50.0, "m/s2"),
-        "headway": (0.0, 100.0, "s"), "jam": (0.1, 100.0, "m"), "lateral": (0.1, 50.0, "m/s2"),
-        "politeness": (0.0, 10.0, ""), "threshold": (0.0, 50.0, "m/s2"), "safe_braking": (0.0, 50.0, "m/s2"),
-        "lane_change_speed": (0.1, 10.0, "m/s"), "verge": (0.0, 10.0, "m"), "give_way": (0.0, 10.0, "m"),
-        "taper": (0.001, 1.0, ""), "beside": (0.0, 10.0, "m"), "spawn_gap": (0.1, 1000.0, "m"),
-        "spawn_gap_ego": (0.1, 1000.0, "m"), "courtesy": (0.0, 1000.0, "m"),
-    },
-}  # fmt: skip
+#: Least and greatest value and unit of each number.
+LIMITS = {
+    "vehicle": limits_of(VehicleConfig),
+    "sensors": limits_of(SensorConfig),
+    "episode": limits_of(EpisodeConfig),
+    "traffic": limits_of(TrafficConfig),
+}
 MOST_STEPS = 65_535  # control steps of an episode
 LENGTH = 4.0  # m, of a car whose unit is 1 m
 LEAST_UNIT = 1 / 16  # m
@@ -276,6 +248,8 @@ class SimConfig:
                 changed: dict[str, Any] = {name: end}
                 replace(self, vehicle=replace(self.vehicle, **changed), randomise=()).check()
         vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
+        if vehicle.model not in MODELS:
+            raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {shown(vehicle.model)}")
         if not vehicle.rear_axle < vehicle.wheelbase:
             text = f"below vehicle.wheelbase, {vehicle.wheelbase:g} m: the centre of mass lies between the axles"
             raise GridSimError(f"vehicle.rear_axle must be {text}, not {vehicle.rear_axle:g}")

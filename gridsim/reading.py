@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import reprlib
 from pathlib import Path
@@ -55,3 +56,13 @@ def number(value: Any, what: str, low: float, high: float, unit: str = "") -> fl
     if not low <= found <= high:
         raise GridSimError(f"{what} must be a number from {low:g} to {high:g}{unit and ' '}{unit}, not {shown(value)}")
     return found
+
+
+def quantity(default: float, low: float, high: float, unit: str = "") -> Any:
+    """A dataclass's field for a number within limits; for a whole number, all three are int."""
+    return dataclasses.field(default=default, metadata={"limits": (low, high, unit)})
+
+
+def limits_of(part: type) -> dict[str, tuple[float, float, str]]:
+    """Least and greatest value and unit of each quantity of a dataclass."""
+    return {field.name: field.metadata["limits"] for field in dataclasses.fields(part) if field.metadata}

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.models import Model
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import NEUTRAL, Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
@@ -29,7 +28,7 @@ class Physics(NamedTuple):
     constants: Constants
     drivers: Drivers
     fan: np.ndarray
-    model: Model
+    model: Any
     imperfections: Imperfections | None
     delays: Delays | None
 

@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
-from gridsim.car.models import Model, front_velocity, model_of, move
-from gridsim.car.vehicle import path_curvature
+from gridsim.car.models import MODELS, front_velocity, hold, move
+from gridsim.collision import collides, hits_box, stands_ahead, top_speed_near
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, I, leaf, njit
 from gridsim.maps.map import Map
@@ -36,7 +35,7 @@ class Simulation(NamedTuple):
     constants: Constants
     drivers: Drivers
     fan: np.ndarray  # of `rays.fan`
-    model: Model  # of the vehicle
+    model: Any  # `Parameters` of the vehicle's model
     imperfections: Imperfections | None  # of the sensor
     delays: Delays | None
 
@@ -45,7 +44,7 @@ def parameters(config: SimConfig) -> tuple[Any, ...]:
     """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(config), rays, model_of(config.vehicle), *imperfections_of(config)
+    return k, drivers(config), rays, MODELS[config.vehicle.model].parameters(config.vehicle), *imperfections_of(config)
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
@@ -127,7 +126,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         step_traffic(simulation.network, simulation.drivers, world, car)
     car[STEERING] = steering
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
-    curvature = path_curvature(constants, speed, car[STEERING])
+    held = hold(simulation.model, constants, car)
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
     near = False
     if world is not None:
@@ -141,7 +140,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     crashed = False
     for part in range(parts):
         x, y, cosine, sine, speed, length = move(
-            simulation.model, constants, car, x, y, cosine, sine, speed, acceleration, curvature, dt
+            simulation.model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt
         )
         moved += length
         if collides(road, constants, x, y, cosine, sine):

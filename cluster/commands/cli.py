@@ -173,7 +173,10 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     digest = ""
     if init := flags.run.init:
         champion = load_champion(init)
-        if champion.policy != str(PolicySpec.parse(settings.policy)):
+        ours, theirs = PolicySpec.parse(settings.policy), PolicySpec.parse(champion.policy)
+        if ours.actions != theirs.actions:
+            raise GridSimError(f"--init {init} has {theirs.actions} actions, this run {ours.actions} ones")
+        if ours != theirs:
             raise GridSimError(f"--init {init} is a {champion.policy}; use --policy {champion.policy}")
         digest = champion.sha256
     place = Path(flags.work.output), flags.run.name

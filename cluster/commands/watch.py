@@ -24,7 +24,7 @@ from cluster import stopping
 from cluster.commands.common import RoadFlags, command_path, main, new_console, parse, short_path
 from cluster.report.film import CODING, Recording, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
-from cluster.settings import IN_WORDS, MAX_TRAFFIC
+from cluster.settings import IN_WORDS, MAX_TRAFFIC, ROADS
 from cluster.store.champion import Champion, UnfinishedError, load_champion
 from cluster.store.checkpoint import CHAMPION, CheckpointError
 from cluster.store.folder import CHECKPOINT, CONFIG, RunError, read_config
@@ -86,8 +86,7 @@ class DriveFlags:
     """
 
     example: ClassVar[str] = "gridsim-drive --scenario city --record drive.csv"
-    scenario: str = "seamless"
-    """Road to drive on: highway, curved, seamless, roundabout, city, or a map file."""
+    scenario: Annotated[str, tyro.conf.arg(help=f"Road to drive on: {ROADS}")] = "seamless"
     sim: str = "default"
     """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
     traffic: Annotated[int, IN_WORDS] = -1

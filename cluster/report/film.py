@@ -45,7 +45,7 @@ class Recording:
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how it ended; RUNNING if only the recording did
     sim: SimConfig  # with which it was driven
-    outputs: np.ndarray | None = None  # float32 [steps + 1, 8], the network's for each action, if they are known
+    outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], the network's, if they are known
 
     @property
     def period(self) -> float:

@@ -33,6 +33,8 @@ from gridsim.view.marks import lane_marks
 TURN = 1 << 16
 PIXELS_PER_M, MOST_PIXELS = 4.0, 2048
 OFF_ROAD, ROAD = (224, 228, 220), (112, 120, 124)  # colours
+ACTIONS = [action.name.lower().replace("_", " ") for action in Action]
+COMMAND = ["pedal", "wheel"]
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,19 @@ class Shown:
         ]
         for k in range(boxes.shape[1]):
             channels += _place(boxes[:, k], size)
-        rays = outputs = 0
+        rays, outputs, middle = 0, list[str](), 0  # the share (%) of a bar where an output of 0 is
         if self.stride == 1:
             rays = drive.ranges.shape[1]
             channels += [ray * 100.0 / float(road.unit) for ray in drive.ranges.T]
             if drive.outputs is not None:
-                outputs = drive.outputs.shape[1]
-                low, high = drive.outputs.min(axis=1, keepdims=True), drive.outputs.max(axis=1, keepdims=True)
-                channels += list(((drive.outputs - low) / np.maximum(high - low, 1e-9) * (TURN - 1)).T)
+                shares = drive.outputs
+                if shares.shape[1] == len(COMMAND):
+                    outputs, middle = COMMAND, 50
+                    shares = 0.5 + shares * [0.5, -0.5]  # a wheel to the left is on the left
+                else:
+                    outputs, low, high = ACTIONS, shares.min(axis=1, keepdims=True), shares.max(axis=1, keepdims=True)
+                    shares = (shares - low) / np.maximum(high - low, 1e-9)
+                channels += list((shares * (TURN - 1)).T)
         numbers = np.rint(channels).astype(np.int64).astype("<u2")
         series = np.diff(numbers, axis=1, prepend=np.zeros((len(numbers), 1), dtype="<u2"))
         return {
@@ -77,6 +84,7 @@ class Shown:
             "cars": boxes.shape[1],
             "rays": rays,
             "outputs": outputs,
+            "middle": middle,
             "series": base64.b64encode(zlib.compress(series.tobytes(), 9)).decode(),
         }
 
@@ -106,7 +114,6 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
         "car": [last.sim.vehicle.length / unit, last.sim.vehicle.width / unit],
         "sensor": float(constant.front_axle) / unit,
         "fan": [float(constant.ray_first), float(constant.ray_step)],
-        "actions": [action.name.lower().replace("_", " ") for action in Action],
         # Centre x, y (m) and half of the dash dx, dy (m).
         "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
         "picture": base64.b64encode(_picture(road_map)).decode(),

@@ -36,16 +36,20 @@ STRESSES = (
     Stress("latency of readings, s", "sensors", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
     Stress("latency of commands, s", "vehicle", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
 )
-KINEMATIC = (Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),)
-DYNAMIC = (
-    Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
-    Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
-)
+OF_MODEL = {
+    "kinematic": (
+        Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
+    ),
+    "single_track": (
+        Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
+        Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
+    ),
+}
 
 
 def stresses(champion: Champion) -> list[Stress]:
     """What can get worse for a champion's vehicle."""
-    return [*STRESSES, *(KINEMATIC if champion.sim.vehicle.model == "kinematic" else DYNAMIC)]
+    return [*STRESSES, *OF_MODEL.get(champion.sim.vehicle.model, ())]
 
 
 def drive(

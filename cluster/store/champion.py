@@ -62,8 +62,10 @@ class Champion:
             return self.traffic
         return default_traffic(scenario, self.sim)
 
-    def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> int | np.ndarray:
+    def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> Any:
         """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
+
+        An action is a number, or of a continuous policy float32 [2], pedal and wheel, each in [-1, 1].
 
         Args: with rays, float32 [32] or [n, 32], or more numbers if the policy sees more; with the grid, a dictionary:
         grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed.
@@ -88,7 +90,7 @@ class Champion:
         spec = PolicySpec.parse(self.policy)
         own: dict[str, Any] = {"observation": spec.observation, "traffic": self.traffic_on(scenario)}
         own["config"] = self.sim
-        own |= {name: value for name, value in vars(spec).items() if name in ("motion", "steering", "frames")}
+        own |= {name: value for name, value in vars(spec).items() if name != "hidden"}
         return GridSimEnv(scenario=scenario, **own | options)
 
     def save(self, path: str | os.PathLike[str]) -> None:

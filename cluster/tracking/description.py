@@ -84,7 +84,7 @@ def group(settings: RunSettings) -> str:
     words += [f"{settings.traffic} cars"] if settings.traffic else []
     given = asdict(settings)
     usual = asdict(type(settings)(settings.scenario, settings.traffic, observation=settings.observation))
-    left_out = {"seed", "policy", "search", *settings.extendable}  # varied, named above, or only limits
+    left_out = {"seed", "policy", "actions", "search", *settings.extendable}  # varied, named above, or only limits
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
 
@@ -129,7 +129,7 @@ def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> s
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
         "Watch it: `drive.html` among the artifacts, or",
         f"    gridsim-watch {shlex.quote(str(folder))}",
-        f"Load it, an ONNX model from the environment's observations [n, ...] to actions [n], which is registered as "
+        f"Load it, an ONNX model from the environment's observations to its actions, n at a time, registered as "
         f"`{model_name(settings)}`:",
         f'    mlflow.pyfunc.load_model("runs:/{{run_id}}/model").predict({takes})["action"]',
         f"Repeat the run: `{settings.command} --config config.json`.",
@@ -144,7 +144,7 @@ def onnx_model(folder: Path, settings: RunSettings, held_out: Mapping[str, float
     return Model(
         model_name(settings),
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
-        "observations and return the action, and a number for each of the eight, of which that has the greatest.",
+        "observations and return its action; where it is one of the eight, also a number for each of these.",
         note=f"{headline(settings)} {held_out['held_out/success_rate']:.1%} of the held-out drives succeed.",
         tags={
             CHAMPION_TAG: champion.sha256,

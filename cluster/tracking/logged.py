@@ -280,18 +280,23 @@ class LoggedRun:
 
 def _write_model(folder: Path, model: Model) -> None:
     """Write a champion as files of MLflow's flavour `onnx` into a new folder."""
-    import numpy as np
     import onnx
     from mlflow.models import ModelSignature
     from mlflow.onnx import save_model
     from mlflow.types.schema import Schema, TensorSpec
 
     inputs = Schema([TensorSpec(array.dtype, (-1, *array.shape[1:]), name) for name, array in model.example.items()])
+    network = onnx.load(model.onnx)
     outputs = Schema([
-        TensorSpec(np.dtype(np.float32), (-1, 8), "outputs"), TensorSpec(np.dtype(np.int64), (-1,), "action"),
+        TensorSpec(
+            onnx.helper.tensor_dtype_to_np_dtype(each.type.tensor_type.elem_type),
+            (-1, *(axis.dim_value for axis in each.type.tensor_type.shape.dim[1:])),
+            each.name,
+        )
+        for each in network.graph.output
     ])  # fmt: skip
     save_model(
-        onnx.load(model.onnx),
+        network,
         str(folder),
         signature=ModelSignature(inputs, outputs),
         input_example=dict(model.example),

@@ -23,7 +23,7 @@ from cluster.workers.child import Child
 from cluster.workers.pool import LOOK_S
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, trajectory
-from evolution.networks.policy import Observation, PolicySpec
+from evolution.networks.policy import CONTINUOUS, Observation, PolicySpec
 from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
 from gridsim.config import SimConfig
@@ -47,6 +47,7 @@ def _marker(settings: RunSettings) -> Path:
     sim = settings.simulator()
     noisy, late = (part is not None for part in imperfections_of(sim))
     chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", "noisy": noisy, "late": late, OWN: has_own(settings)}
+    chosen["continuous"] = settings.policy.endswith(CONTINUOUS)
     special = "".join(f"{name}-" for name, there in chosen.items() if there)
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
     cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()

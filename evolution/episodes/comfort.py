@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gridsim.car.collision import separation
+from gridsim.collision import separation
 from gridsim.jit import ONE, ZERO, F, leaf
 from gridsim.maps.network import wrapped
 from gridsim.state import COS, LANE, SIN, SPEED, X, Y

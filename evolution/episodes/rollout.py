@@ -17,7 +17,7 @@ from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
 from gridsim.car.reward import reward
-from gridsim.car.vehicle import NEUTRAL, act
+from gridsim.car.vehicle import NEUTRAL, act, act_continuous
 from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
@@ -54,16 +54,23 @@ class GridBuffers(NamedTuple):
     grid: np.ndarray  # uint8 [cells]
 
 
-def policy_buffers(spec: PolicySpec, config: SimConfig) -> tuple[np.ndarray | None, GridBuffers | None]:
-    """Buffers for closing speeds, float32 [rays], and for grids; None for what the policy does not see.
+Buffers = tuple[np.ndarray | None, GridBuffers | None, np.ndarray | None]
 
+
+def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
+    """Buffers for closing speeds, float32 [rays], for grids, and for pedal and wheel, float32 [2].
+
+    What the policy does not see is None, as is the last one if it chooses among the eight actions.
     Raises: GridSimError if the sensor has a wrong number of rays.
     """
+    command = None if spec.actions == "discrete" else np.zeros(2, dtype=np.float32)
     if isinstance(spec, CnnSpec):
-        return None, GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
+        grid = np.empty(CELLS * CELLS, dtype=np.uint8)
+        return None, GridBuffers(grid_table(config), convnet.scratch(spec), grid), command
     if config.sensors.rays != RAYS:
         raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
-    return np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None, None
+    closing = np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None
+    return closing, None, command
 
 
 class EpisodeSetup(NamedTuple):
@@ -84,6 +91,7 @@ class Workspace(NamedTuple):
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
     history: History | None  # with delays
+    command: np.ndarray | None  # float32 [2], pedal and wheel, of a policy that has these in place of actions
 
 
 @leaf
@@ -110,7 +118,7 @@ def _keep(workspace, car, world, step):
 
 
 @njit
-def make_workspace(simulation, layers, rows, cars):
+def make_workspace(simulation, layers, rows, cars, command):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
     return Workspace(
         np.empty(CAR_FIELDS, dtype=np.float32),
@@ -120,6 +128,7 @@ def make_workspace(simulation, layers, rows, cars):
         np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
         new_history(simulation.delays, simulation.constants.rays),
+        command,
     )
 
 
@@ -173,11 +182,12 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
 
 @leaf
 def _choose_action(simulation, packed, layers, car, workspace, grid_buffers, begun):
-    """Index of the action for the observation, which is overwritten; -1 if an output is NaN."""
+    """The action (`policy.choose`) for the observation, which is overwritten."""
     if grid_buffers is None:
-        return decide(packed, layers, workspace.scratch)
+        return decide(packed, layers, workspace.scratch, workspace.command)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
-    return convnet.decide(packed, layers, _observed_speed(simulation.constants, car), grid_buffers.scratch)
+    speed = _observed_speed(simulation.constants, car)
+    return convnet.decide(packed, layers, speed, grid_buffers.scratch, workspace.command)
 
 
 @leaf
@@ -190,13 +200,22 @@ def _explore(recorder, steps, action, actions):
 
 
 @leaf
+def _act(constants, car, history, action, command):
+    """Acceleration and steering of an action, or of a command: pedal and wheel."""
+    if command is None:
+        late, _ = late_command(history, car, F(action), ZERO, NEUTRAL)
+        return act(constants, I(late), car[SPEED], car[STEERING])
+    pedal, wheel = late_command(history, car, command[0], command[1], ZERO)
+    return act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
+
+
+@leaf
 def _drive(simulation, setup, car, workspace, world, action):
     """One control step with an action. Returns an End as a number.
 
     A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
-    late, _ = late_command(workspace.history, car, F(action), ZERO, NEUTRAL)
-    acceleration, steering = act(simulation.constants, I(late), car[SPEED], car[STEERING])
+    acceleration, steering = _act(simulation.constants, car, workspace.history, action, workspace.command)
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
 
 
@@ -249,13 +268,14 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
 
 @njit(nogil=True)
 def _rollout(
-    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, notes, results, rewound, rewound_worlds
-):
+    simulation, genomes, layers, setup, traffic, closing, grid_buffers, command, rewind, notes, results,
+    rewound, rewound_worlds,
+):  # fmt: skip
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
     If rewind > 0, also fills rewound [n, 5] and rewound_worlds [n, cars, fields].
     """
-    workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0])
+    workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0], command)
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
@@ -269,14 +289,14 @@ def _rollout(
 
 @njit(nogil=True)
 def _collect(
-    simulation, genome, layers, which, starts, targets, steps, worlds, closing, grid_buffers, epsilons, keys,
+    simulation, genome, layers, which, starts, targets, steps, worlds, closing, grid_buffers, command, epsilons, keys,
     experience, results,
 ):  # fmt: skip
     """Drive a genome through episodes `which` [k] on one map; fills their rows of experience and results.
 
     Args: experience [e, rows, ...]; starts, targets, steps, worlds, epsilons, keys and results [e, ...].
     """
-    workspace = make_workspace(simulation, layers, 0, 0)
+    workspace = make_workspace(simulation, layers, 0, 0, command)
     packed = packed_genome(genome, layers, grid_buffers)
     observations, actions, rewards, ends = experience
     for k in which:
@@ -393,8 +413,8 @@ def trajectory(
     """
     simulation = simulations_on([road_map], config.drawn(start))[0]
     cars = 0 if world is None else len(world)
-    workspace = make_workspace(simulation, spec.layers, steps + 1, cars)
-    closing, grid_buffers = policy_buffers(spec, config)
+    closing, grid_buffers, command = policy_buffers(spec, config)
+    workspace = make_workspace(simulation, spec.layers, steps + 1, cars, command)
     world = world.copy() if world is not None and cars else None
     result = np.zeros(1, dtype=RESULT)
     packed = packed_genome(freeze(genome), spec.layers, grid_buffers)

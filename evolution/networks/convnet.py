@@ -6,12 +6,13 @@ workers need not load PyTorch.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evolution.networks.dense import tile
 from evolution.networks.policy import (
+    ACTIONS,
     KERNEL_1,
     KERNEL_2,
     SIDE_1,
@@ -21,7 +22,7 @@ from evolution.networks.policy import (
     STRIDE_2,
     UNIT_MULTIPLE,
     CnnSpec,
-    greatest,
+    choose,
 )
 from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS
@@ -34,7 +35,7 @@ _WIDE, _WIDEST = 2 * UNIT_MULTIPLE, 4 * UNIT_MULTIPLE
 _convolve_1, _convolve_1_wide = tile(_HALF_ROW, UNIT_MULTIPLE, True), tile(_HALF_ROW, _WIDE, True)
 _convolve_2, _convolve_2_wide = tile(SIDE_2, UNIT_MULTIPLE, True), tile(SIDE_2, _WIDE, True)
 _dense, _dense_wide = tile(1, UNIT_MULTIPLE, True), tile(1, _WIDEST, True)
-_linear = tile(1, UNIT_MULTIPLE, False)
+_linear, _pair = tile(1, ACTIONS, False), tile(1, 2, False)
 
 
 class Scratch(NamedTuple):
@@ -44,7 +45,7 @@ class Scratch(NamedTuple):
     first: np.ndarray  # [19 * 19 * channels]
     second: np.ndarray  # [8 * 8 * channels + 1], the speed last
     dense: np.ndarray  # [units]
-    outputs: np.ndarray  # [actions]
+    outputs: np.ndarray  # [outputs]
 
 
 def scratch(spec: CnnSpec) -> Scratch:
@@ -74,7 +75,7 @@ def forward(genome, layers, speed, scratch):
 
     Args: genome float32 [genes]; layers of `CnnSpec.layers`. A NaN anywhere reaches the outputs.
     """
-    frames, one, two, units = int(layers[0]), int(layers[1]), int(layers[2]), int(layers[3])
+    frames, one, two, units, outputs = int(layers[0]), int(layers[1]), int(layers[2]), int(layers[3]), int(layers[4])
     bias = frames * KERNEL_1 * KERNEL_1 * one
     for y in range(SIDE_1):
         for x in (0, SIDE_1 - _HALF_ROW):
@@ -119,17 +120,18 @@ def forward(genome, layers, speed, scratch):
         _dense(scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0)
         c += UNIT_MULTIPLE
     start = bias + units
-    _linear(
-        scratch.dense, 0, 0, 1, 0, 1, 0, units,
-        genome, start, UNIT_MULTIPLE, start + units * UNIT_MULTIPLE, scratch.outputs, 0, 0,
-    )  # fmt: skip
+    if outputs == ACTIONS:
+        bias = start + units * ACTIONS
+        _linear(scratch.dense, 0, 0, 1, 0, 1, 0, units, genome, start, ACTIONS, bias, scratch.outputs, 0, 0)
+    else:
+        _pair(scratch.dense, 0, 0, 1, 0, 1, 0, units, genome, start, 2, start + units * 2, scratch.outputs, 0, 0)
 
 
 @leaf
-def decide(genome, layers, speed, scratch):
-    """Index of the largest output; -1 if an output is NaN."""
+def decide(genome, layers, speed, scratch, command):
+    """The action (`policy.choose`)."""
     forward(genome, layers, speed, scratch)
-    return greatest(scratch.outputs, 0, scratch.outputs.shape[0])
+    return choose(scratch.outputs, 0, scratch.outputs.shape[0], command)
 
 
 @njit
@@ -137,14 +139,17 @@ def _act_on(genome, layers, frames, speeds, scratch, actions):
     for n in range(frames.shape[0]):
         for k in range(frames.shape[1]):
             push(frames[n, k], False, scratch)
-        actions[n] = decide(genome, layers, speeds[n], scratch)
+        if actions.ndim == 1:
+            actions[n] = decide(genome, layers, speeds[n], scratch, None)
+        else:
+            decide(genome, layers, speeds[n], scratch, actions[n])
 
 
-def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray) -> int | np.ndarray:
+def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray) -> Any:
     """Actions of a genome for grids.
 
     Args: observation uint8 [frames, 80, 80], newest last, or [n, frames, 80, 80]; speed m/s, a number or [n].
-    Returns: an action, or int64 [n]; -1 if an output is NaN.
+    Returns: as `policy.act_on`.
     Raises: ValueError if the observation's shape or type is wrong.
     """
     grids = np.asarray(observation)
@@ -153,6 +158,7 @@ def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: fl
         raise ValueError(f"{spec} sees grids uint8 [{frames}] or [n, {frames}], not {grids.dtype} {grids.shape}")
     grids = np.ascontiguousarray(grids).reshape(-1, spec.frames, CELLS * CELLS)
     speeds = np.ascontiguousarray(np.broadcast_to(np.asarray(speed, dtype=np.float32), len(grids)))
-    actions = np.empty(len(grids), dtype=np.int64)
+    discrete = spec.actions == "discrete"
+    actions = np.empty(len(grids), dtype=np.int64) if discrete else np.empty((len(grids), 2), dtype=np.float32)
     _act_on(freeze(np.ascontiguousarray(genome)), spec.layers, grids, speeds, scratch(spec), actions)
-    return actions if many else int(actions[0])
+    return actions if many else int(actions[0]) if discrete else actions[0]

@@ -1,7 +1,8 @@
 """Policies outside GridSim: as an ONNX graph from the environment's observations to its actions, n at a time.
 
 Inputs: `observation`, float32 [n, inputs]; on the grid `grid`, uint8 [n, frames, 80, 80], and `speed`, float32 [n, 1].
-Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the largest one.
+Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the largest one; of
+continuous actions only `action`, float32 [n, 2], pedal and wheel, each within [-1, 1].
 """
 
 from __future__ import annotations
@@ -59,8 +60,18 @@ def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
     else:
         assert isinstance(spec, MlpSpec)
         last = _add_mlp(graph, spec, genome, config)
-    graph.nodes.append(("Identity", (last,), ("outputs",), {}))
-    graph.nodes.append(("ArgMax", (last,), ("action",), {"axis": 1, "keepdims": 0}))
+    if spec.actions == "continuous":
+        graph.nodes.append(("Identity", (graph.squashed(last),), ("action",), {}))
+        outputs = [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["n", spec.outputs])]
+        meaning = "pedal (below 0: brake) and wheel (left positive), each within [-1, 1]"
+    else:
+        graph.nodes.append(("Identity", (last,), ("outputs",), {}))
+        graph.nodes.append(("ArgMax", (last,), ("action",), {"axis": 1, "keepdims": 0}))
+        outputs = [
+            helper.make_tensor_value_info("outputs", TensorProto.FLOAT, ["n", spec.outputs]),
+            helper.make_tensor_value_info("action", TensorProto.INT64, ["n"]),
+        ]
+        meaning = "the index of the largest output"
     model = helper.make_model(
         helper.make_graph(
             [helper.make_node(kind, inputs, outputs, **more) for kind, inputs, outputs, more in graph.nodes],
@@ -69,16 +80,13 @@ def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
                 helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(x.dtype), ["n", *x.shape[1:]])
                 for name, x in example(spec, config).items()
             ],
-            [
-                helper.make_tensor_value_info("outputs", TensorProto.FLOAT, ["n", spec.outputs]),
-                helper.make_tensor_value_info("action", TensorProto.INT64, ["n"]),
-            ],
+            outputs,
             [numpy_helper.from_array(array, name) for name, array in graph.constants.items()],
         ),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="gridsim",
-        doc_string="Takes GridSim's observations. The action is the index of the largest output.",
+        doc_string=f"Takes GridSim's observations. The action is {meaning}.",
     )
     return model.SerializeToString(deterministic=True)
 

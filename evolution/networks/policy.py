@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import ClassVar, Literal
 
@@ -28,9 +28,12 @@ MAX_GENES = 1_000_000
 RAY_HALF = F(8.0)  # the range that is encoded as 0, in units (`SimConfig.unit`), which are m but for small cars
 SPEED_SCALE = F(10.0)  # m/s, the speed that is encoded as 0; for a perceptron of a small car less (`SimConfig.pace`)
 STEERING_SCALE = F(0.5)  # rad, the steering angle that is encoded as 1
+COMMAND_SCALE = 0.3  # of the genes of the layer of pedal and wheel; with 1 both would mostly be at their limits
 
 
 Observation = Literal["rays", "grid"]
+Actions = Literal["discrete", "continuous"]
+CONTINUOUS = "+continuous"  # ends the text of a policy whose outputs are pedal and wheel
 
 
 @dataclass(frozen=True)
@@ -38,21 +41,26 @@ class PolicySpec(ABC):
     """A network's shape. Two kinds: `MlpSpec` on the rays, `CnnSpec` on the occupancy grid."""
 
     observation: ClassVar[Observation]
-    outputs: ClassVar[int] = ACTIONS  # one for each action; the largest one is chosen
 
     hidden: tuple[int, ...]  # units, or channels, of the hidden layers
+    actions: Actions = field(default="discrete", kw_only=True)
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises GridSimError otherwise."""
-        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
+        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`, also with `+continuous`.
+
+        Raises: GridSimError for any other text.
+        """
+        network = text.removesuffix(CONTINUOUS)
+        actions: Actions = "discrete" if network == text else "continuous"
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", network):
             sizes = tuple(int(n) for n in match[1].split(","))
-            spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
+            spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]), actions=actions)
             if min(sizes) < 1:
                 raise GridSimError(f"policy {text!r}: hidden layers need 1 unit or more")
-        elif match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
+        elif match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", network):
             hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
-            spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
+            spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames), actions=actions)
             if any(n < UNIT_MULTIPLE or n % UNIT_MULTIPLE for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
                 raise GridSimError(
                     f"policy {text!r}: layers of a cnn need a positive multiple of {UNIT_MULTIPLE} units, "
@@ -66,6 +74,16 @@ class PolicySpec(ABC):
         if spec.size > MAX_GENES:
             raise GridSimError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
         return spec
+
+    @property
+    def outputs(self) -> int:
+        """One for each action, of which the largest is chosen; or pedal and wheel."""
+        return ACTIONS if self.actions == "discrete" else 2
+
+    @property
+    def suffix(self) -> str:
+        """The end of its text."""
+        return "" if self.actions == "discrete" else CONTINUOUS
 
     @property
     @abstractmethod
@@ -102,7 +120,7 @@ class MlpSpec(PolicySpec):
 
     def __str__(self) -> str:
         more = ("+motion" if self.motion else "") + ("+steering" if self.steering else "")
-        return "mlp:" + ",".join(map(str, self.hidden)) + more
+        return "mlp:" + ",".join(map(str, self.hidden)) + more + self.suffix
 
     @property
     def inputs(self) -> int:
@@ -144,7 +162,7 @@ class CnnSpec(PolicySpec):
     frames: int = 4
 
     def __str__(self) -> str:
-        return f"cnn:{','.join(map(str, self.hidden))}@{self.frames}"
+        return f"cnn:{','.join(map(str, self.hidden))}@{self.frames}{self.suffix}"
 
     @property
     def inputs(self) -> int:
@@ -169,14 +187,18 @@ class CnnSpec(PolicySpec):
 def gene_scales(spec: PolicySpec) -> np.ndarray:
     """The scale float32 [genes] of each gene: of the spread of new genomes and of mutations.
 
-    1 for a perceptron, whose few inputs are alike. In a convolutional network, the standard deviation of He et al.
-    (2015), sqrt(2 / inputs of the unit), so that a step has the same effect in a layer of 64 inputs as in one of 2,000;
-    half that variance in the linear output layer. The speed's weights have scale 1, because it is one input among a
-    thousand and would have no effect otherwise.
+    1 for a perceptron, whose few inputs are alike, but COMMAND_SCALE in the layer of pedal and wheel. In a
+    convolutional network, the standard deviation of He et al. (2015), sqrt(2 / inputs of the unit), so that a step has
+    the same effect in a layer of 64 inputs as in one of 2,000; half that variance in the linear output layer. The
+    speed's weights have scale 1, because it is one input among a thousand and would have no effect otherwise.
     """
-    if spec.observation == "rays":
-        return freeze(np.ones(spec.size, dtype=np.float32))
     shapes = spec.shapes()
+    if spec.observation == "rays":
+        scales = np.ones(spec.size, dtype=np.float32)
+        if spec.actions == "continuous":
+            units, outputs = shapes[-1]
+            scales[-(units + 1) * outputs :] = COMMAND_SCALE
+        return freeze(scales)
     parts = []
     for k, (n, m) in enumerate(shapes):
         beside = 1 if k == len(shapes) - 2 else 0  # the speed
@@ -308,9 +330,21 @@ def greatest(values, first, n):
 
 
 @leaf
-def decide(packed, layers, scratch):
-    """The action of a perceptron: index of its largest output; -1 if an output is NaN."""
-    return greatest(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1])
+def choose(outputs, first, n, command):
+    """What the n outputs from number `first` on say: the index of the largest one; -1 if one is NaN.
+
+    With a command, float32 [2], they are two: pedal and wheel, each within [-1, 1], are written there, and not -1 is 0.
+    """
+    if command is None:
+        return greatest(outputs, first, n)
+    command[0], command[1] = squash(outputs[first]), squash(outputs[first + 1])
+    return 0 if command[0] == command[0] and command[1] == command[1] else -1
+
+
+@leaf
+def decide(packed, layers, scratch, command):
+    """The action of a perceptron (`choose`)."""
+    return choose(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1], command)
 
 
 @njit
@@ -321,11 +355,17 @@ def _outputs(packed, layers, constants, speed_at, observations, outputs):
             scratch[i] = observations[n, i]
         normalise(constants, RAYS, speed_at, scratch)
         first = forward(packed, layers, scratch)
-        outputs[n] = scratch[first : first + outputs.shape[1]]
+        if outputs.shape[1] == ACTIONS:
+            outputs[n] = scratch[first : first + ACTIONS]
+        else:
+            choose(scratch, first, 2, outputs[n])
 
 
 def outputs_of(spec: MlpSpec, genome: np.ndarray, observations: np.ndarray, config: SimConfig) -> np.ndarray:
-    """Outputs float32 [n, 8] of a perceptron, one for each action, for observations float32 [n, inputs]."""
+    """Outputs of a perceptron for observations float32 [n, inputs].
+
+    Returns: float32 [n, 8], one for each action, or [n, 2], pedal and wheel.
+    """
     outputs = np.empty((len(observations), spec.outputs), dtype=np.float32)
     packed, speed_at = pack(np.ascontiguousarray(genome), spec.layers), 2 * RAYS if spec.motion else RAYS
     _outputs(packed, spec.layers, constants(config), speed_at, np.ascontiguousarray(observations), outputs)
@@ -335,11 +375,13 @@ def outputs_of(spec: MlpSpec, genome: np.ndarray, observations: np.ndarray, conf
 def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config: SimConfig) -> int | np.ndarray:
     """Actions of a genome for the environment's observations, float32 [inputs] or [n, inputs] (`gridsim.envs.env`).
 
-    Returns: an action, or int64 [n]; -1 if an output is NaN. Raises: ValueError for a wrong shape.
+    Returns: an action, or int64 [n], -1 if an output is NaN; or pedal and wheel, float32 [2] or [n, 2].
+    Raises: ValueError for a wrong shape.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    outputs = outputs_of(spec, genome, many, config)
-    actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
-    return int(actions[0]) if np.ndim(observation) == 1 else actions
+    actions = outputs_of(spec, genome, many, config)
+    if spec.actions == "discrete":
+        actions = np.where(np.isnan(actions).any(axis=1), -1, actions.argmax(axis=1))
+    return actions if np.ndim(observation) == 2 else actions[0] if spec.actions == "continuous" else int(actions[0])

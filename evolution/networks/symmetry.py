@@ -38,13 +38,15 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
     With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
     all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
-    Factors are 1, but -1 for weights of the steering angle, and 0 for that of a middle unit.
+    Factors are 1, but -1 for weights of the steering angle and to the wheel, and 0 for those of a middle unit.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
     for k, (inputs, (n, m)) in enumerate(zip(_inputs(spec), shapes, strict=True)):
-        units = np.arange(m)[::-1] if k < len(shapes) - 1 else MIRRORED_ACTIONS
-        sign = np.ones((n + 1, m))
+        units, sign = np.arange(m)[::-1], np.ones((n + 1, m))
+        if k == len(shapes) - 1:
+            units = MIRRORED_ACTIONS if spec.actions == "discrete" else np.arange(2)
+            sign[:, 1] = 1.0 if spec.actions == "discrete" else -1.0  # of the wheel
         if k == 0 and isinstance(spec, MlpSpec) and spec.steering:
             sign[n - 1] = -1.0
         images += [(at + inputs[:, None] * m + units).ravel(), at + n * m + units]

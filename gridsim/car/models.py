@@ -1,46 +1,48 @@
-"""The vehicle models: what moves a car within a control period. A further model is a file like `single_track.py`.
+"""The vehicle models: what moves a car within a control period. Each is a file like `single_track.py`, with
 
-A model's parameters are a type of their own, None for the kinematic one, so that kernels are compiled for one model.
+Parameters, parameters   a vehicle's numbers as kernels read them: a type of its own, so that kernels are compiled
+for one model
+hold(model, constants, car)
+a number that holds for a control period, which `move` gets as `held`
+move(model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt)
+moves for dt seconds with the car's steering angle; pose (m, m, heading as cosine and
+sine), speed m/s, acceleration m/s2. Returns: (x, y, cosine, sine, speed, signed path
+length in m)
+front_velocity(model, constants, car)
+velocity (m/s) of the middle of the front axle, where the sensor is: (along the heading,
+to the left)
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
+from typing import Any
 
-from gridsim.car import vehicle as kinematic
-from gridsim.car.single_track import SingleTrack, advance_single_track, single_track
-from gridsim.config import VehicleConfig
-from gridsim.errors import GridSimError
-from gridsim.jit import leaf
-from gridsim.state import SLIP, SPEED, STEERING, YAW_RATE
+from numba.core.extending import overload
 
-Model = SingleTrack | None
-MODELS = {"kinematic": lambda vehicle: None, "single_track": single_track}
+from gridsim.car import kinematic, single_track
+
+MODELS: dict[str, Any] = {"kinematic": kinematic, "single_track": single_track}
 
 
-def model_of(vehicle: VehicleConfig) -> Model:
-    """The parameters of a vehicle's model. Raises: GridSimError for an unknown one."""
-    if vehicle.model not in MODELS:
-        raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {vehicle.model!r}")
-    return MODELS[vehicle.model](vehicle)
+@dataclass(frozen=True)
+class Numbers(single_track.Numbers):
+    """The numbers of a vehicle that only some models read."""
 
 
-@leaf
-def move(model, constants, car, x, y, cosine, sine, speed, acceleration, curvature, dt):
-    """Move for dt seconds, with the car's steering angle. Arguments and result as those of `vehicle.advance`."""
-    if model is None:
-        return kinematic.advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
-    after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
-    x, y, cosine, sine, speed, car[YAW_RATE], car[SLIP], length = advance_single_track(
-        model, x, y, cosine, sine, speed, car[YAW_RATE], car[SLIP], car[STEERING], (after - speed) / dt, dt
-    )
-    return x, y, cosine, sine, speed, length
+def _by_model(name: str) -> Any:
+    """A function for kernels: that of the model whose parameters its first argument is."""
+    functions = {model.Parameters: getattr(model, name) for model in MODELS.values()}
+
+    def function(model, *rest):
+        raise NotImplementedError
+
+    @overload(function)
+    def of_model(model, *rest):
+        chosen = functions[getattr(model, "instance_class", type(None))]
+        return lambda model, *rest: chosen(model, *rest)
+
+    return function
 
 
-@leaf
-def front_velocity(model, constants, car):
-    """Velocity (m/s) of the middle of the front axle, where the sensor is: (along the heading, to the left)."""
-    if model is None:
-        return kinematic.front_velocity(constants, car[SPEED], car[STEERING])
-    along, aside = car[SPEED] * math.cos(car[SLIP]), car[SPEED] * math.sin(car[SLIP])
-    return along, aside + constants.front_axle * car[YAW_RATE]
+hold, move, front_velocity = map(_by_model, ("hold", "move", "front_velocity"))

@@ -7,8 +7,11 @@ min(S) is the shortest ray after the step, relative to the full range.
 
 from __future__ import annotations
 
-from gridsim.config import CLEARANCE_SHARE, CRASH_REWARD, PROGRESS_SHARE
 from gridsim.jit import F, njit
+
+PROGRESS_SHARE = 0.15  # weight of the distance, and also of the speed
+CLEARANCE_SHARE = 0.7  # weight of the shortest ray
+CRASH_REWARD = -1.0
 
 
 # Compiled without reordering sums or replacing divisions, so that it rounds the same in every kernel that inlines it.

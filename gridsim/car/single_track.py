@@ -13,56 +13,74 @@ KINEMATIC_BELOW, where these divide by almost nothing, w and b are the kinematic
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.config import VehicleConfig
 from gridsim.jit import HALF, ONE, ZERO, F, I, leaf
+from gridsim.reading import quantity
+from gridsim.state import SLIP, SPEED, STEERING, YAW_RATE
 
 GRAVITY = F(9.81)  # m/s2
 KINEMATIC_BELOW = F(1.0)  # m/s
 LONGEST_STEP = F(0.0125)  # s that one step of the integration takes, at most
 
 
-class SingleTrack(NamedTuple):
+@dataclass(frozen=True)
+class Numbers:
+    """The vehicle's numbers that only such models read: those of CommonRoad's vehicle 2, a BMW 320i."""
+
+    mass: float = quantity(1093.3, 0.1, 1e5, "kg")
+    yaw_inertia: float = quantity(1791.6, 1e-4, 1e7, "kg m2")
+    mass_height: float = quantity(0.6137, 0.001, 5.0, "m")  # of the centre of mass
+    friction: float = quantity(1.0489, 0.05, 3.0)  # of tyres and road
+    cornering_stiffness: float = quantity(20.898, 0.5, 200.0, "1/rad")  # of an axle, per load
+
+
+class Parameters(NamedTuple):
     """A car's masses and tyres as kernels read them."""
 
     front: np.float32  # m from the centre of mass to the front axle, lf
     rear: np.float32  # m to the rear axle, lr
     height: np.float32  # m, of the centre of mass, h
     yaw_share: np.float32  # 1/m2, mass / moment of inertia about the vertical axis
-    stiffness_front: np.float32  # 1/rad, C_f: cornering stiffness of the axle, per load
-    stiffness_rear: np.float32  # 1/rad, C_r
+    stiffness: np.float32  # 1/rad, C_f and C_r: cornering stiffness of an axle, per load
     friction: np.float32  # mu
 
 
-def single_track(vehicle: VehicleConfig) -> SingleTrack:
-    """The model of a vehicle."""
-    return SingleTrack(
+def parameters(vehicle: Any) -> Parameters:
+    """Those of a vehicle."""
+    return Parameters(
         front=F(vehicle.wheelbase - vehicle.rear_axle),
         rear=F(vehicle.rear_axle),
         height=F(vehicle.mass_height),
         yaw_share=F(vehicle.mass / vehicle.yaw_inertia),
-        stiffness_front=F(vehicle.cornering_stiffness),
-        stiffness_rear=F(vehicle.cornering_stiffness),
+        stiffness=F(vehicle.cornering_stiffness),
         friction=F(vehicle.friction),
     )
 
 
 @leaf
-def advance_single_track(track, x, y, cosine, sine, speed, yaw_rate, slip, steering, acceleration, dt):
-    """Move for dt seconds with constant steering (rad) and acceleration (m/s2), within which the speed keeps its sign.
+def hold(model, constants, car):
+    """Nothing."""
+    return ZERO
 
-    Args: pose (m, m, heading as cosine and sine), speed m/s, yaw rate rad/s, slip angle rad.
-    Returns: (x, y, cosine, sine, speed, yaw rate, slip, signed path length in m). The implicit midpoint rule, which is
-    stable however stiff the tyres are at low speed.
+
+@leaf
+def move(model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt):
+    """Move for dt seconds, within which the speed keeps its sign; the yaw rate and the slip angle are the car's.
+
+    The implicit midpoint rule, which is stable however stiff the tyres are at low speed.
     """
-    front, rear = track.front, track.rear
+    after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
+    acceleration = (after - speed) / dt
+    yaw_rate, slip, steering = car[YAW_RATE], car[SLIP], car[STEERING]
+    front, rear = model.front, model.rear
     base = front + rear
-    ahead = track.friction * track.stiffness_front * (GRAVITY * rear - acceleration * track.height)
-    behind = track.friction * track.stiffness_rear * (GRAVITY * front + acceleration * track.height)
-    turning, moment = rear * behind - front * ahead, track.yaw_share / base
+    ahead = model.friction * model.stiffness * (GRAVITY * rear - acceleration * model.height)
+    behind = model.friction * model.stiffness * (GRAVITY * front + acceleration * model.height)
+    turning, moment = rear * behind - front * ahead, model.yaw_share / base
     damping = front * front * ahead + rear * rear * behind
     parts = I(1) + I(dt / LONGEST_STEP)
     h = dt / F(parts)
@@ -96,4 +114,12 @@ def advance_single_track(track, x, y, cosine, sine, speed, yaw_rate, slip, steer
         speed += h * acceleration
         yaw_rate, slip = rate_after, slip_after
     norm = F(1.5) - HALF * (cosine * cosine + sine * sine)  # one Newton step of 1 / sqrt keeps the vector's length 1
-    return x, y, cosine * norm, sine * norm, speed, yaw_rate, slip, length
+    car[YAW_RATE], car[SLIP] = yaw_rate, slip
+    return x, y, cosine * norm, sine * norm, speed, length
+
+
+@leaf
+def front_velocity(model, constants, car):
+    """The centre of mass moves at the slip angle, and the front axle turns about it."""
+    along, aside = car[SPEED] * math.cos(car[SLIP]), car[SPEED] * math.sin(car[SLIP])
+    return along, aside + constants.front_axle * car[YAW_RATE]

@@ -1,9 +1,4 @@
-"""The car: kinematic bicycle about the centre of mass (Kong et al. 2015) and the eight driving actions.
-
-Equations, with l_r the distance from the centre of mass to the rear axle and L the wheelbase:
-    beta = atan(l_r / L * tan(steering))        slip angle
-    x' = v cos(psi + beta),  y' = v sin(psi + beta),  psi' = v / l_r * sin(beta),  v' = a
-The path's curvature is sin(beta) / l_r, but at most grip / v^2: a car that is too fast for its tyres runs wide.
+"""The driver's commands: the eight driving actions, and continuous ones.
 
 The steering angle changes at the beginning of a control period and then holds. A wheel that turns evenly within the
 period would lag half a period behind: 0.8 m to the side after 80 m of changing bends.
@@ -11,10 +6,9 @@ period would lag half a period behind: 0.8 m to the side after 80 m of changing 
 
 from __future__ import annotations
 
-import math
 from enum import IntEnum
 
-from gridsim.jit import HALF, ONE, ZERO, F, leaf
+from gridsim.jit import ONE, ZERO, F, leaf
 
 
 class Action(IntEnum):
@@ -79,50 +73,3 @@ def act_continuous(constants, pedal, wheel, speed, steering):
     if pedal < ZERO:
         return brake(constants, -pedal * constants.braking, speed), steering
     return pedal * constants.acceleration, steering
-
-
-@leaf
-def path_curvature(constants, speed, steering):
-    """Curvature (1/m, left positive) of the centre of mass's path: the bicycle model's, limited by lateral grip."""
-    tangent = constants.rear_share * math.tan(steering)  # of the slip angle
-    curvature = tangent / (math.sqrt(ONE + tangent * tangent) * constants.rear_axle)
-    bound = constants.grip / max(speed * speed, F(1e-6))
-    return min(max(curvature, -bound), bound)
-
-
-@leaf
-def front_velocity(constants, speed, steering):
-    """Velocity (m/s) of the middle of the front axle, where the sensor is: (along the heading, to the left).
-
-    The centre of mass moves at the slip angle, and the axle turns about it.
-    """
-    curvature = path_curvature(constants, speed, steering)
-    sine_slip = curvature * constants.rear_axle
-    along = speed * math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))
-    return along, speed * curvature * (constants.rear_axle + constants.front_axle)
-
-
-@leaf
-def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
-    """Move on an arc of constant curvature for dt seconds: exact for constant speed and steering.
-
-    Args: pose (m, m, heading as cosine and sine), speed m/s, acceleration m/s2, curvature 1/m, dt s.
-    Returns: (x, y, cosine, sine, speed, signed path length in m).
-    """
-    after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
-    length = HALF * (speed + after) * dt
-    # The heading changes by `length * curvature`, called turn here; the chord points along heading + slip + turn / 2.
-    half = HALF * length * curvature
-    square = half * half
-    sine_half = half * (ONE - square * (F(1.0 / 6.0) - square * F(1.0 / 120.0)))
-    cosine_half = ONE - square * (HALF - square * (F(1.0 / 24.0) - square * F(1.0 / 720.0)))
-    chord = length * (ONE - square * (F(1.0 / 6.0) - square * F(1.0 / 120.0)))
-    sine_slip = curvature * constants.rear_axle
-    cosine_slip = math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))
-    # Unit vector along heading + turn / 2, then rotated by the slip angle.
-    ch, sh = cosine * cosine_half - sine * sine_half, sine * cosine_half + cosine * sine_half
-    x += chord * (ch * cosine_slip - sh * sine_slip)
-    y += chord * (sh * cosine_slip + ch * sine_slip)
-    c, s = ch * cosine_half - sh * sine_half, sh * cosine_half + ch * sine_half
-    norm = F(1.5) - HALF * (c * c + s * s)  # one Newton step of 1 / sqrt keeps the vector's length 1
-    return x, y, c * norm, s * norm, after, length

@@ -1,49 +1,35 @@
-"""The scenarios: builders of maps from a seed. To add one, write a layout function and register it here."""
+"""The scenarios by name, and their maps from a seed."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
 import numpy as np
 
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.generators.city import city_layout
-from gridsim.maps.generators.curved import curved_layout
-from gridsim.maps.generators.highway import highway_layout
-from gridsim.maps.generators.roundabout import roundabout_layout
-from gridsim.maps.generators.seamless import seamless_layout
-from gridsim.maps.lanes import Plan
+from gridsim.maps import generators
+from gridsim.maps.generators import Scenario
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.roads import THICK_WALL, clearance_nodes, make_road
+from gridsim.maps.roads import clearance_nodes, make_road
 
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp", ".yaml", ".yml")  # files of maps without lanes
 REAL_TRAFFIC = 8  # default number of other cars on real roads
 # First seeds of the maps for training, for the choice of the champion, and for the final report and nothing else.
 TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = 0, 1_000_000, 2_000_000
 
-
-@dataclass(frozen=True)
-class Scenario:
-    """A kind of road: its layout and its driving limitations (the paper's term)."""
-
-    speed_interval: tuple[float, float]  # m/s, within which speed counts
-    traffic: int  # default number of other cars
-    thinnest: float  # m, of its walls and parked cars
-    layout: Callable[[np.random.Generator], Plan]
-
-
-REGISTRY: dict[str, Scenario] = {
-    "highway": Scenario((15.0, 25.0), 8, THICK_WALL, highway_layout),
-    "curved": Scenario((6.0, 15.0), 0, THICK_WALL, curved_layout),
-    "seamless": Scenario((5.0, 12.0), 0, THICK_WALL, seamless_layout),
-    "roundabout": Scenario((5.0, 10.0), 4, 1.0, roundabout_layout),
-    "city": Scenario((3.0, 10.0), 6, 1.0, city_layout),
+_FOUND = {
+    file.name: import_module(f"{generators.__name__}.{file.name}").SCENARIO
+    for file in iter_modules(generators.__path__)
 }
+#: The scenarios by name, the fastest road first.
+REGISTRY: dict[str, Scenario] = dict(
+    sorted(_FOUND.items(), key=lambda item: item[1].speed_interval[::-1], reverse=True)
+)
 
 
 def is_map_file(name: str) -> bool:

@@ -59,14 +59,11 @@ def degrade(imperfections, reach, car, ranges):
     key = mix(mix(place) + U(I(car[STEPS])))
     for r in range(ranges.shape[0]):
         bits = mix(key + U(r + 1) * GOLDEN)
-        if bits >> U(40) < imperfections.dropout:
-            ranges[r] = reach
-            continue
         # Nearly normal: the sum of four uniform numbers (Irwin-Hall).
         total = (bits & U(1023)) + (bits >> U(10) & U(1023)) + (bits >> U(20) & U(1023)) + (bits >> U(30) & U(1023))
         normal = (F(total) - F(2046.0)) * _SIDES
         noisy = ranges[r] + (imperfections.noise + imperfections.noise_share * ranges[r]) * normal
-        ranges[r] = min(max(noisy, ZERO), reach)
+        ranges[r] = reach if bits >> U(40) < imperfections.dropout else min(max(noisy, ZERO), reach)
 
 
 @njit
@@ -83,19 +80,19 @@ def late_readings(history, car, ranges, closing):
     """Put the readings of some steps ago in place of the latest ones; before there are any, the first ones."""
     if history is None or history.readings.shape[0] == 0:
         return
-    steps, slot = I(history.readings.shape[0]), I(car[STEPS]) % I(history.readings.shape[0])
+    steps = I(history.readings.shape[0])
+    if car[STEPS] == ZERO:
+        for k in range(steps):
+            for r in range(ranges.shape[0]):
+                history.readings[k, 0, r] = ranges[r]
+                if closing is not None:
+                    history.readings[k, 1, r] = closing[r]
+    kept = history.readings[I(car[STEPS]) % steps]
     for r in range(ranges.shape[0]):
-        newest = ranges[r]
-        if car[STEPS] == ZERO:
-            for k in range(steps):
-                history.readings[k, 0, r] = newest
-        ranges[r], history.readings[slot, 0, r] = history.readings[slot, 0, r], newest
-        if closing is not None:
-            speed = closing[r]
-            if car[STEPS] == ZERO:
-                for k in range(steps):
-                    history.readings[k, 1, r] = speed
-            closing[r], history.readings[slot, 1, r] = history.readings[slot, 1, r], speed
+        ranges[r], kept[0, r] = kept[0, r], ranges[r]
+    if closing is not None:
+        for r in range(ranges.shape[0]):
+            closing[r], kept[1, r] = kept[1, r], closing[r]
 
 
 @leaf

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from gridsim import state as s
-from gridsim.car.collision import boxes_touch
-from gridsim.car.vehicle import advance, path_curvature
+from gridsim.car.kinematic import advance, path_curvature
+from gridsim.collision import boxes_touch
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import lane_length, to_side, wrapped, wrapped_any

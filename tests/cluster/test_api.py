@@ -36,8 +36,18 @@ def seer():
     return evolve(ON_THE_GRID)[0]
 
 
+@pytest.fixture(scope="module")
+def pedaller():
+    return evolve(dataclasses.replace(SMALL, actions="continuous"))[0]
+
+
 @pytest.mark.parametrize(
-    ("which", "shown"), [("champion", "mlp:64+steering of curved: 2,696"), ("seer", "cnn:8,8,8@2 of curved: 6,248")]
+    ("which", "shown"),
+    [
+        ("champion", "mlp:64+steering of curved: 2,696"),
+        ("seer", "cnn:8,8,8@2 of curved: 6,248"),
+        ("pedaller", "mlp:64+steering+continuous of curved: 2,306"),
+    ],
 )
 def test_load_drive_evaluate(which, shown, request, tmp_path):
     made = request.getfixturevalue(which)

@@ -182,6 +182,8 @@ WRONG = [
     ("--address 127.0.0.1:1", "127.0.0.1:1"),
     ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
     ("--init MADE/c.npz", "is a mlp:6,7; use --policy mlp:6,7"),
+    ("--init MADE/c.npz --policy mlp:6,7 --actions continuous", "has discrete actions, this run continuous ones"),
+    ("--policy mlp:6,7+continuous --device cpu", "the DQN chooses among the eight actions"),
     ("--config MADE/config.json", "gone.npz"),
     ("--device cuda", "PyTorch finds no device 'cuda' here; use --device cpu"),
 ]
@@ -229,6 +231,7 @@ def stopped(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ("--actions continuous", "contradicts the run's mlp:64+steering; leave it out, or start a new run"),
         ("--seed 6", "--seed 6 contradicts the run's 5; leave it out, or start a new run"),
         ("--generations 2", "--generations 2 contradicts the run's 6; give a greater --generations, or start a new"),
         ("--car-steps 1e6", "--car-steps 1000000 does not limit the run; give a greater --generations"),

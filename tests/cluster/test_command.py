@@ -126,6 +126,9 @@ POLICIES = {
     "mlp:64+motion+steering": EvolveSettings("curved", traffic=2),
     "cnn:8,16,32@1": EvolveSettings("city", observation="grid"),
     "mlp:5": EvolveSettings("city", policy="mlp:5"),
+    "mlp:64+steering+continuous": EvolveSettings(actions="continuous"),
+    "mlp:5+motion+continuous": EvolveSettings(policy="mlp:5+motion+continuous", actions="continuous"),
+    "cnn:8,16,32@1+continuous": EvolveSettings(observation="grid", actions="continuous"),
     "cnn:16,32,256@4": DqnSettings(observation="grid", batch=32),
 }
 
@@ -166,6 +169,9 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
     ("kind", "wrong", "said"),
     [
         (EvolveSettings, {"observation": "grid", "policy": "mlp:5"}, "policy mlp:5 sees the rays.*--observation rays"),
+        (EvolveSettings, {"policy": "mlp:5+continuous"}, "policy mlp:5.continuous .* give --actions continuous, too"),
+        (EvolveSettings, {"actions": "both"}, "--actions must be discrete or continuous, not both"),
+        (DqnSettings, {"policy": "mlp:5+continuous"}, "the DQN chooses among the eight actions; leave out .continuous"),
         (EvolveSettings, {"elites": 4}, "--elites is for --recombination two"),
         (EvolveSettings, {"recombination": "two", "mutation_rate": 1.5}, "--mutation-rate must be 0 to 1"),
         (EvolveSettings, {"tournament": 0}, "--tournament must be 1 to"),

@@ -51,6 +51,16 @@ def test_it_uses_a_ray_that_is_in_use_for_the_same_bits_and_leaves_it(tmp_path: 
     assert finish("python", "own.py", cwd=tmp_path, RAY_AUTH_MODE="disabled").stdout.splitlines()[-1] == "True True"
 
 
+@pytest.mark.parametrize("given", [{"policy": "mlp:8", "actions": "continuous"}, {"policy": "mlp:8+continuous"}])
+def test_it_evaluates_networks_of_pedal_and_wheel(given: dict) -> None:
+    with gridsim.Evaluator("curved", sim=SHORT, episodes=2, **given) as evaluator:
+        genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
+        assert evaluator.fitness(genomes).max() > 0.0
+        driver = evaluator.champion(genomes[0])
+    assert driver.policy == "mlp:8+continuous"
+    assert driver.make_env().action_space.shape == (2,)
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

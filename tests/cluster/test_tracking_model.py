@@ -21,25 +21,29 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 
 @pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore")  # of MLflow's and its libraries' own making
-@pytest.mark.parametrize("policy", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
+@pytest.mark.parametrize("policy", ["mlp:6,7+motion+steering", "cnn:8,8,8@2", "mlp:6,7+continuous"])
 def test_mlflow_loads_the_champion(uri, tmp_path, policy, monkeypatch):
     import mlflow
 
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
     spec = PolicySpec.parse(policy)
-    folder = write_run(tmp_path / "a", 1, success_rate=0.5, policy=policy, observation=spec.observation)
+    kind = {"policy": policy, "observation": spec.observation, "actions": spec.actions}
+    folder = write_run(tmp_path / "a", 1, success_rate=0.5, **kind)
     _, run_id = send(folder, uri)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     champion, shown = load_champion(folder), example(spec, SimConfig())
+    gives: dict[str, tuple[int, ...]] = {"outputs": (8,), "action": ()}
+    if spec.actions == "continuous":
+        gives = {"action": (2,)}
     for address in (f"models:/{MODEL}@best", f"runs:/{run_id}/model"):
         loaded = mlflow.pyfunc.load_model(address)
         found = loaded.predict(shown)
-        assert found["outputs"].shape == (2, 8)
-        assert (found["action"] == champion.act(shown.get("observation", shown))).all()
+        assert found["action"] == pytest.approx(champion.act(shown.get("observation", shown)), abs=1e-5)
+        assert {name: array.shape[1:] for name, array in found.items()} == gives
     about = loaded.metadata
     kinds = {each["name"]: each["tensor-spec"] for each in about.signature.inputs.to_dict()}
     assert kinds == {name: {"dtype": str(x.dtype), "shape": (-1, *x.shape[1:])} for name, x in shown.items()}
-    assert [each.name for each in about.signature.outputs] == ["outputs", "action"]
+    assert {each.name: each.shape[1:] for each in about.signature.outputs} == gives
     assert about.metadata["champion_sha256"] == champion.sha256
     stored = tmp_path / "store/mlartifacts" / run_id / "artifacts/model"
     needed = [line.partition("==")[0] for line in (stored / "requirements.txt").read_text().splitlines()]
@@ -98,6 +102,7 @@ def test_seeds_are_one_group_and_nothing_else_is():
         of(DqnSettings, observation="grid"),
     ]  # fmt: skip
     assert len({of(), *others}) == 1 + len(others)
+    assert of(actions="continuous") == "curved evolution mlp:64+steering+continuous"
     assert of(population=64, sigma=0.1) == "curved evolution mlp:64+steering, population 64, sigma 0.1"
     assert of(search="random", traffic=3) == "curved random mlp:64+motion+steering 3 cars"
     assert model_name(EvolveSettings("maps/my town@2.png")) == "gridsim-my_town_2-evolution"

@@ -40,7 +40,7 @@ def kernel_outputs(spec, genome, inputs, junk=0.0):
     scratch[: spec.inputs] = inputs
     again = scratch.copy()
     at = int(policy.forward(packed, spec.layers, scratch))
-    return scratch[at : at + spec.outputs], policy.decide(packed, spec.layers, again)
+    return scratch[at : at + spec.outputs], policy.decide(packed, spec.layers, again, None)
 
 
 def reference(spec, genome, inputs):
@@ -100,13 +100,17 @@ def test_what_the_network_sees():
     assert inputs.min() == -1.0
 
 
-@given(hidden=st.lists(st.integers(1, 40), min_size=1, max_size=4), motion=st.booleans(), steering=st.booleans())
-def test_text_and_back(hidden, motion, steering):
-    text = f"mlp:{','.join(map(str, hidden))}{'+motion' * motion}{'+steering' * steering}"
+ACTIONS = st.sampled_from(["discrete", "continuous"])
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=4), st.booleans(), st.booleans(), ACTIONS)
+def test_text_and_back(hidden, motion, steering, actions):
+    pedal = actions == "continuous"
+    text = f"mlp:{','.join(map(str, hidden))}{'+motion' * motion}{'+steering' * steering}{'+continuous' * pedal}"
     spec = PolicySpec.parse(text)
     assert str(spec) == text
-    assert spec == MlpSpec(tuple(hidden), motion=motion, steering=steering)
-    sizes = [32 + 31 * motion + steering, *hidden, 8]
+    assert spec == MlpSpec(tuple(hidden), motion=motion, steering=steering, actions=actions)
+    sizes = [32 + 31 * motion + steering, *hidden, 2 if pedal else 8]
     assert spec.layers.tolist() == sizes
     assert spec.size == sum((n + 1) * m for n, m in itertools.pairwise(sizes))
 
@@ -114,7 +118,10 @@ def test_text_and_back(hidden, motion, steering):
 WRONG = "mlp mlp:0 mlp:6,0 mlp:6, mlp:6.5 MLP:6 mlp:99999,99999 cnn:16,32 cnn:8,12,16 cnn:0,8,8 cnn:8,8,8@0 cnn:8,8,8@9"
 
 
-@pytest.mark.parametrize("text", [*WRONG.split(), "", "mlp:6,7\n", "cnn:16,64,1024", "cnn@1", " mlp:6"])
+TWICE = ["mlp:6+continuous+steering", "mlp:6+continuous+continuous", "+continuous"]
+
+
+@pytest.mark.parametrize("text", [*WRONG.split(), "", "mlp:6,7\n", "cnn:16,64,1024", "cnn@1", " mlp:6", *TWICE])
 def test_other_texts_are_refused_in_one_line(text):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         PolicySpec.parse(text)
@@ -126,6 +133,7 @@ def test_cnn_alone_is_the_papers_network():
     # Weights and biases: 8 x 8 x 4 to 16, 4 x 4 x 16 to 32, 8 x 8 x 32 and the speed to 256, 256 to 8.
     assert spec.size == (256 + 1) * 16 + (256 + 1) * 32 + (2049 + 1) * 256 + (256 + 1) * 8
     assert (spec.observation, PolicySpec.parse("mlp:6,7").observation) == ("grid", "rays")
+    assert str(PolicySpec.parse("cnn+continuous")) == "cnn:16,32,256@4+continuous"
 
 
 def test_genes_are_as_large_as_he_et_al_have_them():
@@ -134,11 +142,14 @@ def test_genes_are_as_large_as_he_et_al_have_them():
     expected = np.repeat(np.sqrt(2.0 / np.array(inputs)), genes)
     assert gene_scales(PolicySpec.parse("cnn:8,16,32@1")) == pytest.approx(expected)
     assert (gene_scales(PolicySpec.parse("mlp:6,7")) == 1.0).all()
+    pedal = gene_scales(PolicySpec.parse("mlp:6,7+continuous"))
+    assert pedal == pytest.approx(np.repeat([1.0, 0.3], [33 * 6 + 7 * 7, 8 * 2]))
 
 
 # --- Convolutional networks ------------------------------------------------------------------------------------------
 
 SPECS = [CnnSpec((8, 8, 8), 1), CnnSpec((8, 16, 32), 1), CnnSpec((16, 24, 40), 2), CnnSpec((24, 32, 64), 3), CnnSpec()]
+SPECS.append(CnnSpec((8, 16, 24), 2, actions="continuous"))
 
 
 def convolved(spec, genome, frames, speed):
@@ -162,7 +173,9 @@ def test_forward_is_pytorchs(spec):
         expected = network(seen).numpy()[0].astype(float)
         assert np.abs(expected).max() > 1e-3
         assert outputs == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
-        assert convnet.act_on(spec, genome, frames, float(speed)) == int(outputs.argmax())
+        pedal = spec.actions == "continuous"
+        action = [policy.squash(each) for each in outputs] if pedal else int(outputs.argmax())
+        assert convnet.act_on(spec, genome, frames, float(speed)) == pytest.approx(action, abs=1e-6)
 
 
 def test_a_cnns_gene_that_is_not_a_number_is_no_action():
@@ -173,8 +186,8 @@ def test_a_cnns_gene_that_is_not_a_number_is_no_action():
     for gene in [*range(0, spec.size, 37), *range(spec.size - 140, spec.size)]:
         spoilt = genome.copy()
         spoilt[gene] = math.nan
-        assert convnet.decide(spoilt, spec.layers, F(5), room) == -1, gene
-    assert convnet.decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
+        assert convnet.decide(spoilt, spec.layers, F(5), room, None) == -1, gene
+    assert convnet.decide(genome, spec.layers, F(5), room, None) >= 0  # and nothing of it stays
 
 
 # --- Left-right symmetry ---------------------------------------------------------------------------------------------
@@ -200,21 +213,26 @@ def test_left_and_right_are_exchanged_and_nothing_else():
 
 
 @settings(max_examples=40, derandomize=True)
-@given(spec=st.builds(MlpSpec, HIDDEN, motion=st.booleans(), steering=st.booleans()), seed=st.integers(0, 1 << 40))
+@given(
+    st.builds(MlpSpec, HIDDEN, motion=st.booleans(), steering=st.booleans(), actions=ACTIONS), st.integers(0, 1 << 40)
+)
 def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, seed):
+    """Or the pedal is the same, and the wheel turns to the other side."""
     observations = np.random.default_rng(seed).random((60, spec.inputs)).astype(F)
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
     genome = new_genomes(spec, seed=seed)[0]
 
     both = observations, in_a_mirror(spec, observations)
     one, other = (outputs_of(spec, genome, seen, SimConfig()) for seen in both)
-    assert np.abs(one).max() > 0.1
-    np.testing.assert_allclose(one[:, MIRRORED_ACTIONS], other, atol=1e-4)
+    assert (np.abs(one).max(axis=0) > 0.05).all()
+    mirrored = one[:, MIRRORED_ACTIONS] if spec.actions == "discrete" else one * [1, -1]
+    np.testing.assert_allclose(mirrored, other, atol=1e-4)
 
 
+@pytest.mark.parametrize("more", ["", "+continuous"])
 @pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:64+steering", "mlp:3+motion+steering", "cnn:8,16,24@2"])
-def test_every_gene_is_free_or_bound_to_a_free_one(policy):
-    spec = PolicySpec.parse(policy)
+def test_every_gene_is_free_or_bound_to_a_free_one(policy, more):
+    spec = PolicySpec.parse(policy + more)
     free, bound, source, factor = symmetry(spec)
     assert sorted([*free, *bound]) == list(range(spec.size))
     assert np.isin(source[factor != 0.0], free).all()
@@ -303,8 +321,10 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
 
 
 @CONFIGS
+@pytest.mark.parametrize("more", ["", "+continuous"])
 @pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering", "cnn:8,8,24@2"])
-def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, config, tmp_path):
+def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, more, config, tmp_path):
+    text += more
     genome = np.random.default_rng(7).normal(0.0, 0.2, PolicySpec.parse(text).size).astype(F)
     champion = Champion(genome, text, "curved", config)
     champion.export_onnx(tmp_path / "champion.onnx")
@@ -319,8 +339,12 @@ def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champ
     for _ in range(10):
         seen = batch.sample()
         actions += session.run(["action"], seen if isinstance(seen, dict) else {"observation": seen})[0].tolist()
-        assert actions[-1000:] == np.asarray(champion.act(seen)).tolist()
-    assert len(set(actions)) > 1
+        assert actions[-1000:] == pytest.approx(np.asarray(champion.act(seen)), abs=1e-5 if more else 0)
+    assert len(np.unique(actions, axis=0)) > 1
+    assert np.ptp(actions, axis=0).min() > 0.1
+    assert np.abs(actions).max() <= (1 if more else 7)
+    pedals = champion.make_env(maps=1).action_space
+    assert all(pedals.contains(action) for action in champion.act(seen))
 
 
 def test_without_onnx_a_line_says_what_to_install(monkeypatch, tmp_path):
@@ -331,7 +355,7 @@ def test_without_onnx_a_line_says_what_to_install(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("text", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
+@pytest.mark.parametrize("text", ["mlp:6,7+motion+steering", "cnn:8,8,8@2", "mlp:3+continuous"])
 def test_the_same_genome_gives_the_same_file_in_any_process_without_torch(text, tmp_path):
     script = (
         "import sys, numpy as np\n"

@@ -76,18 +76,20 @@ def test_readings_and_commands_are_late_by_the_control_steps_of_their_latency(ro
     )
 
 
-def test_a_network_drives_in_the_environment_as_in_training(road: Map) -> None:
-    spec, rng = PolicySpec.parse("mlp:8+steering"), np.random.default_rng(3)
+@pytest.mark.parametrize("policy", ["mlp:8+steering", "mlp:8+steering+continuous"])
+def test_a_network_drives_in_the_environment_as_in_training(road: Map, policy: str) -> None:
+    spec, rng = PolicySpec.parse(policy), np.random.default_rng(3)
     start, steps = sample_starts(road, 1, rng)[0], 0
     while steps < 60:
         genome = rng.normal(size=spec.size).astype(np.float32)
         result, states, _ = trajectory(spec, genome, road, start, 2000.0, 300, ALL)
         steps = int(result["steps"])
-    env = GridSimEnv("curved", config=ALL, steering=True, max_episode_steps=300)
+    env = GridSimEnv("curved", config=ALL, steering=True, max_episode_steps=300, actions=spec.actions)
     seen, _ = env.reset(seed=0, options={"map_seed": 1, "start": start})
     for step in range(1, steps + 1):
         seen, _, terminated, _, info = env.step(act_on(spec, genome, seen, ALL))
         assert info["distance_m"] == pytest.approx(float(states[step, DISTANCE]), abs=1e-3)
+        assert env.cars.simulator.cars[0].tobytes() == states[step].tobytes()
     assert terminated or steps == 300
     perfect, *_ = trajectory(spec, genome, road, start, 2000.0, 300, SimConfig())
     assert perfect["distance"] != result["distance"]

@@ -20,7 +20,7 @@ CALLER = """
 import json
 import numpy as np
 from gridsim import jit
-from gridsim.car import collision
+from gridsim import collision
 from gridsim.maps import roads
 from gridsim.config import SimConfig, constants
 u, f = np.uint32, np.float32

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from pictures import cars_on, small_map, straight_road
 
-from gridsim.car.collision import hits_box, stands_ahead, top_speed_near
 from gridsim.car.vehicle import Action
+from gridsim.collision import hits_box, stands_ahead, top_speed_near
 from gridsim.config import SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes

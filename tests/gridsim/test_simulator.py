@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from pictures import crashes, small_map
 from scipy.integrate import solve_ivp
 
-from gridsim.car.vehicle import Action, act, act_continuous, advance, path_curvature
+from gridsim.car.kinematic import advance, path_curvature
+from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import EpisodeConfig, SimConfig, VehicleConfig, constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build

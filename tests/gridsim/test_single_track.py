@@ -8,14 +8,13 @@ from scipy.integrate import solve_ivp
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
 from vehiclemodels.vehicle_dynamics_st import vehicle_dynamics_st
 
-from gridsim.car.models import model_of
-from gridsim.car.single_track import advance_single_track
-from gridsim.config import SimConfig, VehicleConfig
+from gridsim.car import single_track
+from gridsim.config import SimConfig, VehicleConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
-from gridsim.state import SLIP, SPEED, YAW_RATE
+from gridsim.state import CAR_FIELDS, SLIP, SPEED, STEERING, YAW_RATE
 from gridsim.step import parameters
 
 THEIRS = parameters_vehicle2()
@@ -27,15 +26,16 @@ SEDAN = VehicleConfig(
 
 
 @njit
-def advance(model, x, y, cosine, sine, speed, yaw_rate, slip, steering, acceleration, dt):
-    return advance_single_track(model, x, y, cosine, sine, speed, yaw_rate, slip, steering, acceleration, dt)
+def move(model, constants, car, x, y, cosine, sine, speed, acceleration, dt):
+    return single_track.move(model, constants, car, 0.0, x, y, cosine, sine, speed, acceleration, dt)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_ten_seconds_of_changing_steering_and_speed_are_commonroads(seed: int) -> None:
-    rng, model, steering = np.random.default_rng(seed), model_of(SEDAN), 0.0
+    rng, model, steering = np.random.default_rng(seed), single_track.parameters(SEDAN), 0.0
+    k, car = constants(SimConfig(SEDAN)), np.zeros(CAR_FIELDS, np.float32)
     speed = rng.uniform(5.0, 25.0)
-    wanted, state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0, 0.0]), np.array([0, 0, 1, 0, speed, 0, 0], np.float32)
+    wanted, state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0, 0.0]), np.array([0, 0, 1, 0, speed], np.float32)
     for _ in range(100):
         grip = min(0.47, SEDAN.lateral_grip * SEDAN.wheelbase / wanted[3] ** 2)
         steering = float(np.clip(steering + rng.uniform(-0.1, 0.1), -grip, grip))
@@ -45,11 +45,12 @@ def test_ten_seconds_of_changing_steering_and_speed_are_commonroads(seed: int) -
             lambda _, x, a=acceleration: vehicle_dynamics_st(x, [0.0, a], THEIRS), (0.0, 0.1), wanted, rtol=1e-8
         )
         wanted = change.y[:, -1]
-        *moved, length = advance(model, *state, *np.array([steering, acceleration, 0.1], np.float32))
+        car[STEERING] = steering
+        *moved, length = move(model, k, car, *state, *np.array([acceleration, 0.1], np.float32))
         state = np.array(moved, np.float32)
         assert math.hypot(state[0] - wanted[0], state[1] - wanted[1]) < 0.05
         assert length == pytest.approx(0.1 * (state[4] - 0.05 * acceleration), rel=1e-4)
-    assert state[4:] == pytest.approx(wanted[[3, 5, 6]], abs=5e-3)
+    assert [state[4], car[YAW_RATE], car[SLIP]] == pytest.approx(wanted[[3, 5, 6]], abs=5e-3)
     assert math.atan2(state[3], state[2]) == pytest.approx(math.remainder(wanted[4], math.tau), abs=5e-3)
 
 

@@ -12,8 +12,8 @@ from pictures import cars_on, crashes, straight_road
 from scipy import stats
 
 from gridsim import state
-from gridsim.car.collision import boxes_touch, hits_box
-from gridsim.car.vehicle import path_curvature
+from gridsim.car.kinematic import path_curvature
+from gridsim.collision import boxes_touch, hits_box
 from gridsim.config import SimConfig, VehicleConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes

@@ -9,7 +9,7 @@ import yaml
 from PIL import Image
 
 from gridsim import state
-from gridsim.car.collision import collides
+from gridsim.collision import collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import freeze, njit
 from gridsim.maps.map import without_lanes

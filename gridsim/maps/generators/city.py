@@ -11,8 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gridsim.maps.generators.squares import DIRECTIONS, Layout, components
+from gridsim.maps.generators import Scenario
 from gridsim.maps.lanes import Path, Plan
+from gridsim.maps.squares import DIRECTIONS, Layout, components
 
 SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
@@ -107,3 +108,6 @@ def city_layout(rng: np.random.Generator) -> Plan:
                 gap = (ys[(j + 1) % rows] - y) % SIDE
                 street(x, y + half, 1, gap - half - corner[(j + 1) % rows, i])
     return layout.finish(SIDE)
+
+
+SCENARIO = Scenario(city_layout, (3.0, 10.0), traffic=6, thinnest=1.0)

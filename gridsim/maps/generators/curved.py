@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from gridsim.jit import njit
+from gridsim.maps.generators import Scenario
 from gridsim.maps.lanes import Path, Plan, backwards, beside, lay_lanes, sample, strips_along
 
 SIDE = 256.0  # m, of the torus
@@ -103,3 +104,6 @@ def curved_layout(rng: np.random.Generator) -> Plan:
             break
     paths = beside(middle, -LANE_WIDTH / 2) + beside(backwards(middle), -LANE_WIDTH / 2)
     return strips_along(middle, HALF_ROAD), lay_lanes(paths, SIDE, SIDE)
+
+
+SCENARIO = Scenario(curved_layout, (6.0, 15.0))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gridsim.maps.generators import Scenario
 from gridsim.maps.lanes import Path, Plan, beside, lay_lanes, strips_along
 
 WIDTH, HEIGHT = 1024.0, 128.0  # m, of the torus
@@ -43,3 +44,6 @@ def highway_layout(rng: np.random.Generator) -> Plan:
     lanes = [beside(middle, offset) for offset in offsets]
     abreast = [lane[k] for k in range(len(pieces)) for lane in lanes]
     return strips_along(middle, HALF_ROAD), lay_lanes(abreast, WIDTH, HEIGHT, LANE_COUNT)
+
+
+SCENARIO = Scenario(highway_layout, (15.0, 25.0), traffic=8)

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, rotated
-from gridsim.maps.generators.tiles import HALF_ROAD, LANE_WIDTH, TILE, TILES, tile_graph
+from gridsim.maps.generators import Scenario
 from gridsim.maps.lanes import Plan
+from gridsim.maps.squares import DIRECTIONS, Layout, Pieces, rotated
+from gridsim.maps.tiles import HALF_ROAD, LANE_WIDTH, TILE, TILES, tile_graph
 
 RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
 HALF_RING = 4.5  # m, half width of the ring, wide enough for a lorry to turn
@@ -63,3 +64,6 @@ def lay_tiles(rng: np.random.Generator, edges: np.ndarray, share: float) -> Plan
             layout.join(x, y, TILE / 2, arms)
             layout.connect(x, y, TILE / 2, arms)
     return layout.finish(TILE * TILES)
+
+
+SCENARIO = Scenario(roundabout_layout, (5.0, 10.0), traffic=4, thinnest=1.0)

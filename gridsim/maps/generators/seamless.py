@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gridsim.maps.generators import Scenario
 from gridsim.maps.generators.roundabout import lay_tiles
-from gridsim.maps.generators.tiles import tile_graph
 from gridsim.maps.lanes import Plan
+from gridsim.maps.tiles import tile_graph
 
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 
@@ -14,3 +15,6 @@ ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 def seamless_layout(rng: np.random.Generator) -> Plan:
     """A network."""
     return lay_tiles(rng, tile_graph(rng), ROUNDABOUT_SHARE)
+
+
+SCENARIO = Scenario(seamless_layout, (5.0, 12.0))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.maps.generators.squares import DIRECTIONS, components
+from gridsim.maps.squares import DIRECTIONS, components
 
 TILE = 32.0  # m, side of a tile
 TILES = 8  # along each side of the torus
