@@ -232,7 +232,9 @@ def change_lanes(network, drivers, world, i, ego):
         return
     car[s.LANE_TIMER] = drivers.lane_change_steps - ONE
     lane = I(car[s.LANE])
-    near = is_junction(network, I(car[s.NEXT])) and lane_length(network, lane) - car[s.ALONG] < config.KEEP_LANE
+    onward = I(car[s.NEXT])
+    ends = is_junction(network, onward) or max(network.left[onward], network.right[onward]) < 0
+    near = ends and lane_length(network, lane) - car[s.ALONG] < config.KEEP_LANE
     if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0 and not near:
         _choose_neighbour(network, drivers, world, i, ego)
 

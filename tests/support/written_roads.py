@@ -9,9 +9,10 @@ GERMANY, BRITAIN = (50.0, 9.0), (52.0, -3.0)
 HALF = 1.6  # m, half the width of a lane
 
 
-def osm(
-    ways: Sequence[tuple[Sequence[tuple[float, float]], dict[str, str]]], place: tuple[float, float] = GERMANY
-) -> str:
+Way = tuple[Sequence[tuple[float, float]], dict[str, str]]
+
+
+def osm(ways: Sequence[Way], place: tuple[float, float] = GERMANY) -> str:
     """Ways of points (m) with their tags; points that are the same are one node."""
     north, east = 111_240.0, 111_320.0 * math.cos(math.radians(place[0])) * 1.00196
     numbers: dict[tuple[float, float], int] = {}
@@ -30,7 +31,7 @@ def osm(
     return f'<?xml version="1.0"?><osm version="0.6">{nodes}{text}</osm>'
 
 
-def street(*points: tuple[float, float], **tags: str) -> tuple[Sequence[tuple[float, float]], dict[str, str]]:
+def street(*points: tuple[float, float], **tags: str) -> Way:
     """A way of two lanes."""
     return points, {"highway": "residential", "lanes": "2", "maxspeed": "50", **tags}
 

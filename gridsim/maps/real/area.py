@@ -18,7 +18,7 @@ SLIT = 2  # pixels around the road in which walls that are as thin on both sides
 ISLAND = 30.0  # m2; smaller walls inside of junctions are taken for gaps, too
 _REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, of the longest distance in the field
 
-SHARP = 0.15  # rad
+SHARP = 0.1  # rad
 SWEPT = 2.5  # m around a sharp bend that a car's corners may pass
 _CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
 _OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1

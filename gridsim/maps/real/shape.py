@@ -18,8 +18,8 @@ from gridsim.maps.real.select import on_rings
 
 APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
 LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
-ABREAST = 4.8  # m between lanes side by side, at most
-ACROSS = 100.0  # m, of ways across a junction that are made one lane, at most
+DIVIDED = 0.5  # m between two lanes from which cars do not change from one to the other
+ACROSS = 75.0  # m, of ways across a junction that are made one lane, at most
 ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
 WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
 NEAR_END = 25.0  # m from a road's end within which what crosses it is part of the junction there
@@ -330,8 +330,9 @@ def _unlink(lanes: dict[str, Lane], gap: float) -> None:
     for group in groups_of(lanes):
         for left, right in pairwise(group):
             n = max(math.ceil(lanes[left].length / LANE_STEP), 1)
-            away = resampled(lanes[left], n)[0] - resampled(lanes[right], n)[0]
-            if np.hypot(*away.T).min() < gap or np.hypot(*away.T).max() > ABREAST:
+            (one, half), (other, other_half) = (resampled(lanes[key], n) for key in (left, right))
+            away = np.hypot(*(one - other).T)
+            if away.min() < gap or (away - half - other_half).max() > DIVIDED:
                 lanes[left].right_lane = lanes[right].left_lane = ""
 
 
