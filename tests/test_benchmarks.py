@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hosts
 import pytest
+from written_roads import osm, street
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script (and its mode) and how it is run here; what `--json` must print.
@@ -22,6 +23,7 @@ RUNS = {
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
     ),
     "peers.py": ([], None),
+    "roads.py": (["--minutes", "0.2", "--cars", "4", "--json"], {"block.osm km", "block.osm overlaps"}),
     "scaling.py": (
         ["--quick", "--json"],
         {
@@ -46,11 +48,15 @@ def test_every_script_is_run_here() -> None:
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", RUNS)
-def test_script_runs(name: str, tmp_path: Path) -> None:
+def test_script_runs(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     if "--cluster" in name and (reason := hosts.missing()):
         pytest.skip(reason)
     arguments, figures = RUNS[name]
     script, *mode = name.split()
+    if script == "roads.py":
+        block = tmp_path_factory.mktemp("roads") / "block.osm"
+        block.write_text(osm([street((0, 0), (200, 0), (200, 200), (0, 200), (0, 0))]))
+        mode = [str(block)]
     command = [sys.executable, str(FOLDER / script), *mode, *arguments]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     # A peer has to be named; and in so few generations memory still grows.
