@@ -39,7 +39,7 @@ from cluster.store.champion import Champion, load_champion
 from cluster.store.checkpoint import CheckpointError
 from evolution.episodes.rollout import evaluate
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, decide, normalise, pack, scratch_size
+from evolution.networks.policy import PolicySpec, decide, pack, scratch_size
 from evolution.networks.symmetry import space
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
@@ -47,7 +47,7 @@ from gridsim.config import constants
 from gridsim.jit import njit
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.sensing.observation import encode
+from gridsim.sensing.observation import encoding, normalise
 from gridsim.state import DISTANCE
 
 MAPS = 8
@@ -83,12 +83,11 @@ def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 
 
 
 @njit
-def _actions(packed, layers, constants, ranges, speeds, actions):
+def _actions(packed, layers, encoding, observations, actions):
     """The actions of one network in many cars."""
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for i in range(len(actions)):
-        encode(constants, ranges[i], None, speeds[i], np.float32(0.0), scratch)
-        normalise(constants, ranges.shape[1], ranges.shape[1], scratch)
+        normalise(encoding, observations[i], scratch)
         actions[i] = decide(packed, layers, scratch, None)
 
 
@@ -105,7 +104,7 @@ def vector_env(
         CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
     )
     layers = PolicySpec.parse(champion.policy).layers
-    packed, sizes = pack(champion.genome, layers), constants(champion.sim)
+    packed, encoded = pack(champion.genome, layers), encoding((), constants(champion.sim))
     actions = np.zeros(CARS, dtype=np.int64)
     _, info = env.reset(seed=0)
     # As in a long run, the cars are spread over the length of their episodes, so that resets come evenly.
@@ -116,7 +115,7 @@ def vector_env(
     for run in range(runs + 1):
         spent, driven = 0.0, 0
         for _ in range(steps):
-            _actions(packed, layers, sizes, env.simulator.ranges, info["speed_mps"], actions)
+            _actions(packed, layers, encoded, env.simulator.observations, actions)
             driven += CARS - int(over.sum())
             start = time.perf_counter()
             _, _, terminations, truncations, info = env.step(actions)

@@ -140,13 +140,6 @@ class TrafficConfig:
     courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind a car that stands this close is not idle
 
 
-#: Least and greatest value and unit of each number.
-LIMITS = {
-    "vehicle": limits_of(VehicleConfig),
-    "sensors": limits_of(SensorConfig),
-    "episode": limits_of(EpisodeConfig),
-    "traffic": limits_of(TrafficConfig),
-}
 MOST_STEPS = 65_535  # control steps of an episode
 LENGTH = 4.0  # m, of a car whose unit is 1 m
 LEAST_UNIT = 1 / 16  # m
@@ -265,6 +258,10 @@ class SimConfig:
         if not 1 <= episode.steps <= MOST_STEPS:
             text = f"1 to {MOST_STEPS:,} times episode.control_period, {episode.control_period:g} s"
             raise GridSimError(f"episode.time_limit must be {text}, not {episode.time_limit:g}")
+
+
+#: Least and greatest value and unit of each number.
+LIMITS = {name: limits_of(part) for name, part in vars(SimConfig()).items() if dataclasses.is_dataclass(part)}
 
 
 def _ranges(given: Any) -> tuple[tuple[str, float, float], ...]:

@@ -63,6 +63,6 @@ def quantity(default: float, low: float, high: float, unit: str = "") -> Any:
     return dataclasses.field(default=default, metadata={"limits": (low, high, unit)})
 
 
-def limits_of(part: type) -> dict[str, tuple[float, float, str]]:
+def limits_of(part: Any) -> dict[str, tuple[float, float, str]]:
     """Least and greatest value and unit of each quantity of a dataclass."""
     return {field.name: field.metadata["limits"] for field in dataclasses.fields(part) if field.metadata}

@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import NEUTRAL, Action, act, act_continuous
-from gridsim.config import Constants, SimConfig, constants
+from gridsim.config import SimConfig, constants
 from gridsim.jit import ZERO, F, I, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.imperfections import Delays, History, Imperfections, imperfections_of, late_command
+from gridsim.sensing.imperfections import History, imperfections_of, late_command
+from gridsim.sensing.observation import encoding
 from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
-from gridsim.traffic.behaviour import Drivers
 
 MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
 
 
-class Physics(NamedTuple):
-    """A `step.Simulation` of several maps."""
-
-    atlas: Atlas
-    constants: Constants
-    drivers: Drivers
-    fan: np.ndarray
-    model: Any
-    imperfections: Imperfections | None
-    delays: Delays | None
+Physics = tuple[Atlas, tuple[Any, ...]]  # several maps, and the `step.parameters`
 
 
 @njit
 def _on_map(physics, row):
     """The Simulation of a map of the atlas."""
-    road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
-    k, drivers, fan, model, imperfections, delays = physics[1:]
-    return Simulation(road, network, k, drivers, fan, model, imperfections, delays)
+    return Simulation(road_of(physics[0], row), network_of(physics[0], row), *physics[1])
 
 
 @njit
@@ -50,29 +39,29 @@ def _history_of(histories, i):
 
 
 @njit(nogil=True)
-def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing, histories):
+def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, histories):
     """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
+    ranges, closing, observations = seen
     for row, first, last in runs:
         simulation = _on_map(physics, row)
         for k in order[first:last]:
             i = which[k]
             world = None if worlds is None else worlds[i]
             place(simulation, starts[k], cars[i], visits[i])
-            look(simulation, cars[i], world, ranges[i], closing[i], _history_of(histories, i))
+            look(simulation, cars[i], world, ranges[i], closing[i], observations[i], _history_of(histories, i))
 
 
 @njit(nogil=True)
-def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen, histories):
+def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
     """One control period of every car; one whose episode has ended stands still.
 
     Args: cars `order` map by map; runs int64 [maps, 3], a map's row in the atlas and its cars' range in `order`; seen,
-    ranges and closing speeds [n, rays] and rewards [n], to be filled.
+    ranges and closing speeds [n, rays] and observations [n, values], and rewards [n], to be filled.
     """
-    constants = physics.constants
-    ranges, closing, rewards = seen
+    ranges, closing, observations = seen
     for row, first, last in runs:
         simulation = _on_map(physics, row)
-        fastest = simulation.road.speed_high
+        constants, fastest = simulation.constants, simulation.road.speed_high
         for i in order[first:last]:
             car = cars[i]
             world = None if worlds is None else worlds[i]
@@ -85,8 +74,8 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 else:
                     pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
                     acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-                ends[i] = step(simulation, car, visits[i], world, acceleration, steering, target, max_steps)
-            look(simulation, car, world, ranges[i], closing[i], history)
+                ends[i] = step(simulation, car, visits[i], world, acceleration, steering, *limits)
+            look(simulation, car, world, ranges[i], closing[i], observations[i], history)
             if runs_on:
                 gained = car[DISTANCE] - before
                 rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
@@ -108,7 +97,8 @@ class Simulator:
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
-        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `rays.cast_boxes`.
+        closing: float32 [n, rays], m/s, the closing speeds that go with them; [n, 0] if the features lack `motion`.
+        observations: float32 [n, values], what networks see of that (`sensing.observation`).
     """
 
     def __init__(
@@ -118,8 +108,9 @@ class Simulator:
         target: float | None = None,
         max_steps: int | None = None,
         traffic: int = 0,
+        features: tuple[str, ...] = (),
     ):
-        """Make room for `cars` cars, each with a world of `traffic` other cars.
+        """Make room for `cars` cars, each with a world of `traffic` other cars; observations have these features.
 
         `target` (m) and `max_steps` (control steps) are the configuration's unless given.
         """
@@ -133,13 +124,15 @@ class Simulator:
             raise ValueError(f"traffic must be 0 cars or more, not {traffic}")
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
-        constants(self.config)  # raises for a wrong configuration
+        self.features = features
+        values = encoding(features, constants(self.config)).first[-1]  # raises for a wrong configuration
         self.cars = np.zeros((cars, CAR_FIELDS), dtype=np.float32)
         self.visits = np.zeros((cars, 0), dtype=np.float32)
         self.ends = np.zeros(cars, dtype=np.uint8)
         self.worlds = np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32)  # all are absent
         self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
-        self.closing = np.zeros_like(self.ranges)
+        self.closing = np.zeros((cars, self.config.sensors.rays * ("motion" in features)), dtype=np.float32)
+        self.observations = np.zeros((cars, values), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._starts = np.zeros((cars, 5), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
@@ -191,17 +184,17 @@ class Simulator:
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
         self._starts[cars] = starts
         self._drawn = {i: drawn for i, drawn in self._drawn.items() if i not in cars}
-        arrays = self.cars, self.visits, self._traffic(), self.ranges, self.closing, self._histories
         for batch in self._batches(cars):
-            _place_all(*batch, cars, starts, *arrays)
+            _place_all(*batch, cars, starts, *self._arrays())
 
     def forget_maps(self) -> None:
         """Have the next reset keep only maps on which there are cars."""
         self._row_of = {}
 
-    def _traffic(self) -> np.ndarray | None:
-        """The worlds, or None without traffic."""
-        return self.worlds if self.worlds.shape[1] else None
+    def _arrays(self) -> tuple[Any, ...]:
+        """State of all cars as kernels read it; worlds are None without traffic."""
+        worlds, seen = self.worlds if self.worlds.shape[1] else None, (self.ranges, self.closing, self.observations)
+        return self.cars, self.visits, worlds, seen, self._histories
 
     def _batches(self, cars: np.ndarray | None = None) -> Iterator[tuple[Physics, np.ndarray, np.ndarray]]:
         """Cars [k], by default all, in batches with the same physics: that, `order` and `runs` as kernels read them.
@@ -210,14 +203,14 @@ class Simulator:
         """
         if self._physics is None:
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
-            self._physics = Physics(atlas, *parameters(self.config))
+            self._physics = atlas, parameters(self.config, self.features)
         if not self.config.randomise:
             yield self._physics, *(self._groups if cars is None else _by_map(self._rows[cars]))
             return
         for k, i in enumerate(range(len(self)) if cars is None else cars.tolist()):
             if i not in self._drawn:
-                self._drawn[i] = parameters(self.config.drawn(self._starts[i]))
-            yield Physics(self._physics.atlas, *self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
+                self._drawn[i] = parameters(self.config.drawn(self._starts[i]), self.features)
+            yield (self._physics[0], self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
@@ -244,24 +237,26 @@ class Simulator:
             raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
-        seen = self.ranges, self.closing, rewards
-        arrays = self.cars, self.visits, self._traffic(), self.ends, seen, self._histories
+        limits = np.float32(self.target), self.max_steps
         for batch in self._batches():
-            _control_all(*batch, actions, np.float32(self.target), self.max_steps, *arrays)
+            _control_all(*batch, actions, limits, self.ends, rewards, *self._arrays())
         return rewards
 
 
-def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:
+def views(
+    scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig, features: tuple[str, ...] = ()
+) -> tuple[np.ndarray, np.ndarray]:
     """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS].
 
-    Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
+    Returns: ranges (m) of the rays, float32 [n, rays], and observations with these features, float32 [n, values].
     """
-    simulation = simulations_on([scenario], config)[0]
+    simulation = simulations_on([scenario], config, features)[0]
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
-    closing = np.zeros_like(ranges)
-    for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
-        look(simulation, car, world, seen, speeds, None)
-    return ranges, closing
+    observations = np.empty((len(cars), simulation.encoding.first[-1]), dtype=np.float32)
+    closing = np.zeros(config.sensors.rays * ("motion" in features), dtype=np.float32)
+    for car, world, row, observation in zip(cars, worlds, ranges, observations, strict=True):
+        look(simulation, car, world, row, closing, observation, None)
+    return ranges, observations
 
 
 def checked_actions(actions: np.ndarray) -> np.ndarray:

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.models import MODELS, front_velocity, hold, move
+from gridsim.car.kinematic import path_curvature
+from gridsim.car.models import MODELS, front_velocity, move
 from gridsim.collision import collides, hits_box, stands_ahead, top_speed_near
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, I, leaf, njit
@@ -20,6 +21,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
 from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_readings
+from gridsim.sensing.observation import Encoding, encoding, observe
 from gridsim.sensing.rays import cast_boxes, fan, sense
 from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
@@ -38,18 +40,19 @@ class Simulation(NamedTuple):
     model: Any  # `Parameters` of the vehicle's model
     imperfections: Imperfections | None  # of the sensor
     delays: Delays | None
+    encoding: Encoding
 
 
-def parameters(config: SimConfig) -> tuple[Any, ...]:
+def parameters(config: SimConfig, features: tuple[str, ...] = ()) -> tuple[Any, ...]:
     """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
-    k = constants(config)
+    k, model = constants(config), MODELS[config.vehicle.model].parameters(config.vehicle)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(config), rays, MODELS[config.vehicle.model].parameters(config.vehicle), *imperfections_of(config)
+    return k, drivers(config), rays, model, *imperfections_of(config), encoding(features, k)
 
 
-def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
-    """A Simulation for each map. Raises: ValueError for an invalid configuration."""
-    shared = parameters(config)
+def simulations_on(road_maps: Sequence[Map], config: SimConfig, features: tuple[str, ...] = ()) -> list[Simulation]:
+    """A Simulation for each map, as `parameters`."""
+    shared = parameters(config, features)
     return [Simulation(each.road, each.network, *shared) for each in road_maps]
 
 
@@ -95,23 +98,23 @@ def start_from(car, start):
 
 
 @leaf
-def look(simulation, car, world, ranges, closing, history):
+def look(simulation, car, world, ranges, closing, observation, history):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
-    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `rays.cast_boxes`.
-    With a `history` they are as late as the simulation's delays.
+    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], unless that is [0], as in
+    `rays.cast_boxes`; the observation float32 [values]. With a `history` ranges and closing speeds are as late as the
+    simulation's delays.
     """
     road, constants, fan = simulation.road, simulation.constants, simulation.fan
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
     if world is not None:
-        velocity = (ZERO, ZERO)
-        if closing is not None:
-            velocity = front_velocity(simulation.model, constants, car)
+        velocity = front_velocity(simulation.model, constants, car) if closing.shape[0] > 0 else (ZERO, ZERO)
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
     degrade(simulation.imperfections, constants.ray_range, car, ranges)
     late_readings(history, car, ranges, closing)
+    observe(simulation, car, world, ranges, closing, observation)
 
 
 @leaf
@@ -126,7 +129,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         step_traffic(simulation.network, simulation.drivers, world, car)
     car[STEERING] = steering
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
-    held = hold(simulation.model, constants, car)
+    curvature = path_curvature(constants, speed, steering)
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
     near = False
     if world is not None:
@@ -140,7 +143,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     crashed = False
     for part in range(parts):
         x, y, cosine, sine, speed, length = move(
-            simulation.model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt
+            simulation.model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt
         )
         moved += length
         if collides(road, constants, x, y, cosine, sine):

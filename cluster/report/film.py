@@ -18,9 +18,8 @@ from cluster.store.champion import Champion
 from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
-from gridsim.config import SimConfig, constants
+from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.sensing.observation import observations
 from gridsim.simulator import views
 from gridsim.state import DISTANCE, LANE, SPEED, End, X, Y
 
@@ -72,11 +71,8 @@ def record(
     end = End(int(result["end"]))
     if end == End.TIME and steps < episode.steps:
         end = End.RUNNING
-    ranges, closing = views(scenario, cars, worlds, champion.sim)
-    outputs = None
-    if isinstance(spec, MlpSpec):
-        seen = observations(constants(champion.sim), ranges, closing if spec.motion else None, cars, spec.steering)
-        outputs = outputs_of(spec, champion.genome, seen, champion.sim)
+    ranges, seen = views(scenario, cars, worlds, champion.sim, spec.features)
+    outputs = outputs_of(spec, champion.genome, seen, champion.sim) if isinstance(spec, MlpSpec) else None
     return Recording(scenario, cars, ranges, other_cars(worlds), end, champion.sim, outputs)
 
 

@@ -36,15 +36,12 @@ STRESSES = (
     Stress("latency of readings, s", "sensors", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
     Stress("latency of commands, s", "vehicle", "latency", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)),
 )
-OF_MODEL = {
-    "kinematic": (
-        Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
-    ),
-    "single_track": (
-        Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
-        Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
-    ),
-}
+KINEMATIC = (Stress("grip, share of its own", "vehicle", "lateral_grip", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),)
+DYNAMIC = (
+    Stress("friction, share of its own", "vehicle", "friction", (1.0, 0.9, 0.8, 0.7, 0.6, 0.5), share=True),
+    Stress("mass, share of its own", "vehicle", "mass", (1.0, 1.1, 1.2, 1.3, 1.4, 1.5), share=True),
+)
+OF_MODEL = {"kinematic": KINEMATIC, "single_track": DYNAMIC}
 
 
 def stresses(champion: Champion) -> list[Stress]:

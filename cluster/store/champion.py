@@ -90,7 +90,8 @@ class Champion:
         spec = PolicySpec.parse(self.policy)
         own: dict[str, Any] = {"observation": spec.observation, "traffic": self.traffic_on(scenario)}
         own["config"] = self.sim
-        own |= {name: value for name, value in vars(spec).items() if name != "hidden"}
+        own |= {name: value for name, value in vars(spec).items() if name not in ("hidden", "features")}
+        own |= dict.fromkeys(spec.features, True)
         return GridSimEnv(scenario=scenario, **own | options)
 
     def save(self, path: str | os.PathLike[str]) -> None:

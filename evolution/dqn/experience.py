@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
+from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
+from gridsim.sensing.observation import SPEED_SCALE
 
 NO_ACTION = 255  # of an episode's last row
 UNITS = F(4096.0)  # fixed-point units per 1

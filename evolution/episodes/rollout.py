@@ -15,7 +15,7 @@ from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, s
 from evolution.episodes import comfort
 from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
-from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, normalise, pack, scratch_size
+from evolution.networks.policy import RAYS, CnnSpec, PolicySpec, decide, pack, scratch_size
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import NEUTRAL, act, act_continuous
 from gridsim.config import MOST_STEPS, SimConfig
@@ -25,7 +25,7 @@ from gridsim.jit import ZERO, F, I, U, exact, freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.imperfections import History, late_command, new_history
-from gridsim.sensing.observation import encode, speed_share
+from gridsim.sensing.observation import normalise
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
@@ -54,23 +54,21 @@ class GridBuffers(NamedTuple):
     grid: np.ndarray  # uint8 [cells]
 
 
-Buffers = tuple[np.ndarray | None, GridBuffers | None, np.ndarray | None]
+Buffers = tuple[GridBuffers | None, np.ndarray | None]
 
 
 def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
-    """Buffers for closing speeds, float32 [rays], for grids, and for pedal and wheel, float32 [2].
+    """Buffers for grids, if the policy sees these, and for pedal and wheel, float32 [2], if it decides these.
 
-    What the policy does not see is None, as is the last one if it chooses among the eight actions.
     Raises: GridSimError if the sensor has a wrong number of rays.
     """
     command = None if spec.actions == "discrete" else np.zeros(2, dtype=np.float32)
     if isinstance(spec, CnnSpec):
         grid = np.empty(CELLS * CELLS, dtype=np.uint8)
-        return None, GridBuffers(grid_table(config), convnet.scratch(spec), grid), command
+        return GridBuffers(grid_table(config), convnet.scratch(spec), grid), command
     if config.sensors.rays != RAYS:
         raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
-    closing = np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None
-    return closing, None, command
+    return None, command
 
 
 class EpisodeSetup(NamedTuple):
@@ -87,6 +85,8 @@ class Workspace(NamedTuple):
     car: np.ndarray  # float32 [CAR_FIELDS]
     visits: np.ndarray  # float32 [cells]
     ranges: np.ndarray  # float32 [rays]
+    closing: np.ndarray  # float32 [rays], [0] if it is not seen
+    observation: np.ndarray  # float32 [values]
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
@@ -124,6 +124,8 @@ def make_workspace(simulation, layers, rows, cars, command):
         np.empty(CAR_FIELDS, dtype=np.float32),
         np.empty(visit_cells(simulation.road), dtype=np.float32),
         np.empty(simulation.constants.rays, dtype=np.float32),
+        np.zeros(simulation.encoding.first[2] - simulation.encoding.first[1], dtype=np.float32),
+        np.empty(simulation.encoding.first[-1], dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
@@ -147,21 +149,20 @@ class Recorder(NamedTuple):
 
 
 @leaf
-def _observe(simulation, car, world, workspace, closing, grid_buffers):
-    """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
-    look(simulation, car, world, workspace.ranges, closing, workspace.history)
+def _observe(simulation, car, world, workspace, grid_buffers):
+    """Look around, then compute the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
+    ranges, closing, observation = workspace.ranges, workspace.closing, workspace.observation
+    look(simulation, car, world, ranges, closing, observation, workspace.history)
     if grid_buffers is None:
-        encode(simulation.constants, workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
-        rays = workspace.ranges.shape[0]
-        normalise(simulation.constants, rays, rays if closing is None else 2 * rays, workspace.scratch)
+        normalise(simulation.encoding, observation, workspace.scratch)
     else:
         fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
 
 
 @exact
-def _observed_speed(constants, car):
-    """The speed (m/s) that a network on the grid reads from its observation."""
-    return speed_share(constants, car[SPEED]) * constants.speed_limit
+def _observed_speed(simulation, observation):
+    """The speed (m/s) that a network on the grid reads from its observation, whose last value it is."""
+    return observation[observation.shape[0] - 1] * simulation.constants.speed_limit
 
 
 @leaf
@@ -171,7 +172,7 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
     else:
-        store_grid(grid_buffers.grid, _observed_speed(simulation.constants, car), observations[row])
+        store_grid(grid_buffers.grid, _observed_speed(simulation, workspace.observation), observations[row])
     actions[row], rewards[row], ends[row] = NO_ACTION, F(0.0), 0
     if row > 0:
         k, ranges = simulation.constants, workspace.ranges
@@ -181,12 +182,12 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
 
 
 @leaf
-def _choose_action(simulation, packed, layers, car, workspace, grid_buffers, begun):
-    """The action (`policy.choose`) for the observation, which is overwritten."""
+def _choose_action(simulation, packed, layers, workspace, grid_buffers, begun):
+    """The action (`policy.choose`) for the observation."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch, workspace.command)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
-    speed = _observed_speed(simulation.constants, car)
+    speed = _observed_speed(simulation, workspace.observation)
     return convnet.decide(packed, layers, speed, grid_buffers.scratch, workspace.command)
 
 
@@ -220,7 +221,7 @@ def _drive(simulation, setup, car, workspace, world, action):
 
 
 @njit(nogil=True)
-def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, notes, result):
+def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, recorder, notes, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
 
     Notes, float32 [comfort.NOTES], are for the figures of comfort; without them, None, these are left as they are.
@@ -238,13 +239,13 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     while True:
         if recorder is None and end != 0:
             break
-        _observe(simulation, car, world, workspace, closing, grid_buffers)
+        _observe(simulation, car, world, workspace, grid_buffers)
         if recorder is not None:
             gained = car[DISTANCE] - before
             _record(simulation, car, workspace, grid_buffers, recorder.experience, steps, gained, end)
             if end != 0:
                 break
-        action = _choose_action(simulation, packed, layers, car, workspace, grid_buffers, steps == 0)
+        action = _choose_action(simulation, packed, layers, workspace, grid_buffers, steps == 0)
         if action < 0:
             end = _IDLE
             if recorder is not None and steps > 0:
@@ -268,8 +269,8 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
 
 @njit(nogil=True)
 def _rollout(
-    simulation, genomes, layers, setup, traffic, closing, grid_buffers, command, rewind, notes, results,
-    rewound, rewound_worlds,
+    simulation, genomes, layers, setup, traffic, grid_buffers, command, rewind, notes, results, rewound,
+    rewound_worlds,
 ):  # fmt: skip
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
@@ -279,7 +280,7 @@ def _rollout(
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
-        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, notes, results[i])
+        run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, None, notes, results[i])
         if rewind > 0:
             row_back = max(int(results[i]["steps"]) - rewind, 0) % rewind
             start_from(workspace.ring[row_back], rewound[i])
@@ -289,7 +290,7 @@ def _rollout(
 
 @njit(nogil=True)
 def _collect(
-    simulation, genome, layers, which, starts, targets, steps, worlds, closing, grid_buffers, command, epsilons, keys,
+    simulation, genome, layers, which, starts, targets, steps, worlds, grid_buffers, command, epsilons, keys,
     experience, results,
 ):  # fmt: skip
     """Drive a genome through episodes `which` [k] on one map; fills their rows of experience and results.
@@ -303,9 +304,7 @@ def _collect(
         setup = EpisodeSetup(starts[k], targets[k], steps[k])
         world = None if worlds is None else worlds[k].copy()
         recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
-        run_episode(
-            simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, None, results[k]
-        )
+        run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, recorder, None, results[k])
 
 
 def _check_steps(episodes: np.ndarray) -> None:
@@ -342,17 +341,18 @@ def evaluate(
     k = int(kept[-1]) + 1 if len(kept) else 0
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
-    simulations, notes = simulations_on(road_maps, config), np.empty(NOTES, np.float32) if with_comfort else None
+    simulations = simulations_on(road_maps, config, spec.features)
+    notes = np.empty(NOTES, np.float32) if with_comfort else None
     for column, episode in enumerate(episodes):
         simulation = simulations[episode["map"]]
         if config.randomise:
-            simulation = simulations_on([road_maps[episode["map"]]], config.drawn(episode["start"]))[0]
+            simulation = simulations_on([road_maps[episode["map"]]], config.drawn(episode["start"]), spec.features)[0]
         setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
         traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
         row = kept[column]
         _rollout(
-            simulation, genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
-            notes, results[column], rewound[row], rewound_worlds[row],
+            simulation, genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]), notes,
+            results[column], rewound[row], rewound_worlds[row],
         )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
 
@@ -375,7 +375,7 @@ def collect(
     Raises: ValueError if a time limit is out of range.
     """
     _check_steps(episodes)
-    buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config)
+    buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config, spec.features)
     weights = freeze(weights.astype(np.float32, copy=False))
     setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))
     traffic = freeze(worlds.copy()) if worlds.shape[1] else None
@@ -389,7 +389,7 @@ def collect(
         m = int(episodes["map"][which[0]])
         simulation = simulations[m]
         if config.randomise:
-            simulation = simulations_on([road_maps[m]], config.drawn(episodes["start"][group]))[0]
+            simulation = simulations_on([road_maps[m]], config.drawn(episodes["start"][group]), spec.features)[0]
         _collect(simulation, weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results)
     driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
     return Experience(*(array[driven] for array in experience)), results
@@ -411,17 +411,15 @@ def trajectory(
     Returns: (RESULT []; before each step and at the end, the states float32 [steps + 1, CAR_FIELDS], and the traffic
     float32 [steps + 1, cars, TRAFFIC_FIELDS]).
     """
-    simulation = simulations_on([road_map], config.drawn(start))[0]
+    simulation = simulations_on([road_map], config.drawn(start), spec.features)[0]
     cars = 0 if world is None else len(world)
-    closing, grid_buffers, command = policy_buffers(spec, config)
+    grid_buffers, command = policy_buffers(spec, config)
     workspace = make_workspace(simulation, spec.layers, steps + 1, cars, command)
     world = world.copy() if world is not None and cars else None
     result = np.zeros(1, dtype=RESULT)
     packed = packed_genome(freeze(genome), spec.layers, grid_buffers)
     setup, recorder = EpisodeSetup(freeze(start), F(target), steps), None
-    run_episode(
-        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, None, result[0]
-    )  # fmt: skip
+    run_episode(simulation, packed, spec.layers, setup, workspace, world, grid_buffers, recorder, None, result[0])
     last = int(result[0]["steps"])
     workspace.ring[last] = workspace.car
     if world is not None:

@@ -17,7 +17,6 @@ from evolution.networks.policy import (
     KERNEL_2,
     SIDE_1,
     SIDE_2,
-    SPEED_SCALE,
     STRIDE_1,
     STRIDE_2,
     UNIT_MULTIPLE,
@@ -26,6 +25,7 @@ from evolution.networks.policy import (
 )
 from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS
+from gridsim.sensing.observation import SPEED_SCALE
 
 _CODE = F(1.0 / 255.0)
 _AREA = CELLS * CELLS

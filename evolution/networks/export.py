@@ -7,7 +7,6 @@ continuous actions only `action`, float32 [n, 2], pedal and wheel, each within [
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,19 +14,16 @@ import numpy as np
 from evolution.networks.policy import (
     KERNEL_1,
     KERNEL_2,
-    RAY_HALF,
-    RAYS,
-    SPEED_SCALE,
-    STEERING_SCALE,
     STRIDE_1,
     STRIDE_2,
     CnnSpec,
     MlpSpec,
     PolicySpec,
 )
-from gridsim.config import SimConfig
+from gridsim.config import SimConfig, constants
 from gridsim.packages import check_extra
 from gridsim.sensing.grid import CELLS, FREE
+from gridsim.sensing.observation import FEATURES, SPEED_SCALE, encoding
 
 OPSET, IR_VERSION = 17, 8
 """Versions of ONNX's operators and file format: of 2022, so that runtimes on small computers read it."""
@@ -131,17 +127,12 @@ class _Graph:
 
 def _add_mlp(graph: _Graph, spec: MlpSpec, genome: np.ndarray, config: SimConfig) -> str:
     """Add a perceptron to a graph. Returns: the name of its outputs."""
-    ranges, rest = "ranges", "rest"
-    columns = graph.constant([RAYS, spec.inputs - RAYS], np.int64)
-    graph.nodes.append(("Split", ("observation", columns), (ranges, rest), {"axis": 1}))
-    ranges = graph.add("Mul", ranges, graph.constant(config.sensors.range))
-    near = graph.add("Div", ranges, graph.add("Add", ranges, graph.constant(float(RAY_HALF) * config.unit)))
-    speed = config.vehicle.speed_limit / (float(SPEED_SCALE) * config.pace)
-    scales, shifts = [speed] * RAYS * spec.motion + [speed], [0.0] * RAYS * spec.motion + [-1.0]
-    if spec.steering:
-        scales.append(math.radians(config.vehicle.steering_limit) / float(STEERING_SCALE))
-        shifts.append(0.0)
-    x = graph.add("Concat", graph.horner(near, 2.0, -1.0), graph.horner(rest, scales, shifts), axis=1)
+    encoded = encoding(spec.features, constants(config))
+    near, full, scale, shift = (encoded.each(numbers) for numbers in (encoded.near, encoded.full, *encoded[4:]))
+    value = graph.add("Mul", "observation", graph.constant(full))
+    resolved = graph.add("Div", value, graph.add("Add", value, graph.constant(scale)))
+    rest = graph.horner("observation", scale, shift)
+    x = graph.add("Where", graph.constant(near, bool), graph.horner(resolved, 2.0, -1.0), rest)
     *hidden, last = layers_of(spec, genome)
     for layer in hidden:
         x = graph.squashed(graph.dense(x, *layer))
@@ -171,5 +162,7 @@ def example(spec: PolicySpec, config: SimConfig) -> dict[str, np.ndarray]:
         return {"grid": np.full((2, spec.frames, CELLS, CELLS), FREE, dtype=np.uint8), "speed": shares[:, None]}
     assert isinstance(spec, MlpSpec)
     observations = np.zeros((2, spec.inputs), dtype=np.float32)  # wheels straight ahead
-    observations[:, :RAYS], observations[:, 2 * RAYS if spec.motion else RAYS] = 1.0, shares
+    encoded = encoding(spec.features)
+    observations += encoded.each(feature.near for feature in FEATURES)  # nothing in sight
+    observations += shares[:, None] * encoded.each(feature.name == "speed" for feature in FEATURES)
     return {"observation": observations}

@@ -16,20 +16,18 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from evolution.networks.dense import tile
-from gridsim.config import SimConfig, constants
+from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.errors import GridSimError
-from gridsim.jit import F, U, exact, freeze, leaf, njit
+from gridsim.jit import F, U, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
+from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 
-RAYS = 31
-INPUTS = RAYS + 1  # the rays and the speed
+RAYS = SensorConfig.rays
 ACTIONS = 8
 MAX_GENES = 1_000_000
-RAY_HALF = F(8.0)  # the range that is encoded as 0, in units (`SimConfig.unit`), which are m but for small cars
-SPEED_SCALE = F(10.0)  # m/s, the speed that is encoded as 0; for a perceptron of a small car less (`SimConfig.pace`)
-STEERING_SCALE = F(0.5)  # rad, the steering angle that is encoded as 1
 COMMAND_SCALE = 0.3  # of the genes of the layer of pedal and wheel; with 1 both would mostly be at their limits
 
+_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # of a specification
 
 Observation = Literal["rays", "grid"]
 Actions = Literal["discrete", "continuous"]
@@ -44,6 +42,7 @@ class PolicySpec(ABC):
 
     hidden: tuple[int, ...]  # units, or channels, of the hidden layers
     actions: Actions = field(default="discrete", kw_only=True)
+    features: tuple[str, ...] = field(default=(), kw_only=True)  # also seen: of `observation.OPTIONAL`, in that order
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
@@ -53,9 +52,9 @@ class PolicySpec(ABC):
         """
         network = text.removesuffix(CONTINUOUS)
         actions: Actions = "discrete" if network == text else "continuous"
-        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", network):
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)" + _FEATURES, network):
             sizes = tuple(int(n) for n in match[1].split(","))
-            spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]), actions=actions)
+            spec: PolicySpec = MlpSpec(sizes, features=tuple(network.split("+")[1:]), actions=actions)
             if min(sizes) < 1:
                 raise GridSimError(f"policy {text!r}: hidden layers need 1 unit or more")
         elif match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", network):
@@ -68,8 +67,8 @@ class PolicySpec(ABC):
                 )
         else:
             raise GridSimError(
-                f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
-                "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
+                f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, and what else it "
+                f"sees (+{', +'.join(OPTIONAL)}), or cnn for the grid, as in cnn:8,16,32@1"
             )
         if spec.size > MAX_GENES:
             raise GridSimError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
@@ -107,24 +106,19 @@ class PolicySpec(ABC):
 
 @dataclass(frozen=True)
 class MlpSpec(PolicySpec):
-    """A multi-layer perceptron on rays and speed: tanh hidden layers, linear outputs.
+    """A multi-layer perceptron on rays, the speed, and other features: tanh hidden layers, linear outputs.
 
-    With `motion` it also sees the closing speeds of cars hit by rays (`rays.cast_boxes`), with `steering` its own
-    steering angle, which a network without memory cannot infer: the wheels take half a second to turn.
+    A network without memory cannot infer, for example, its own steering angle: the wheels take half a second to turn.
     """
 
     observation = "rays"
 
-    motion: bool = False
-    steering: bool = False
-
     def __str__(self) -> str:
-        more = ("+motion" if self.motion else "") + ("+steering" if self.steering else "")
-        return "mlp:" + ",".join(map(str, self.hidden)) + more + self.suffix
+        return "+".join(["mlp:" + ",".join(map(str, self.hidden)), *self.features]) + self.suffix
 
     @property
     def inputs(self) -> int:
-        return INPUTS + (RAYS if self.motion else 0) + self.steering
+        return int(encoding(self.features).first[-1])
 
     @property
     def layers(self) -> np.ndarray:
@@ -205,24 +199,6 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
         size = np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / (n - beside))
         parts += [np.full((n - beside) * m, size), np.ones(beside * m), np.full(m, size)]
     return freeze(np.concatenate(parts).astype(np.float32))
-
-
-@exact
-def normalise(constants, rays, speed_at, observation):
-    """Turn an observation (`gridsim.sensing.observation`) into the network's inputs, in place.
-
-    Ranges r (m; of small cars in their unit) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds,
-    the speed, which is number `speed_at`, and the steering angle follow; a network without `+steering` does not read
-    the angle.
-    """
-    for i in range(rays):  # a number known to the compiler would be unrolled, and not vectorised
-        reach = observation[i] * constants.ray_range
-        observation[i] = F(2.0) * reach / (reach + RAY_HALF * constants.unit) - F(1.0)
-    scale = constants.speed_limit / (SPEED_SCALE * constants.pace)
-    for i in range(rays, speed_at):
-        observation[i] = observation[i] * scale
-    observation[speed_at] = observation[speed_at] * scale - F(1.0)
-    observation[speed_at + 1] = observation[speed_at + 1] * (constants.steering_limit / STEERING_SCALE)
 
 
 @leaf
@@ -348,12 +324,10 @@ def decide(packed, layers, scratch, command):
 
 
 @njit
-def _outputs(packed, layers, constants, speed_at, observations, outputs):
+def _outputs(packed, layers, encoding, observations, outputs):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for n in range(observations.shape[0]):
-        for i in range(observations.shape[1]):
-            scratch[i] = observations[n, i]
-        normalise(constants, RAYS, speed_at, scratch)
+        normalise(encoding, observations[n], scratch)
         first = forward(packed, layers, scratch)
         if outputs.shape[1] == ACTIONS:
             outputs[n] = scratch[first : first + ACTIONS]
@@ -367,8 +341,8 @@ def outputs_of(spec: MlpSpec, genome: np.ndarray, observations: np.ndarray, conf
     Returns: float32 [n, 8], one for each action, or [n, 2], pedal and wheel.
     """
     outputs = np.empty((len(observations), spec.outputs), dtype=np.float32)
-    packed, speed_at = pack(np.ascontiguousarray(genome), spec.layers), 2 * RAYS if spec.motion else RAYS
-    _outputs(packed, spec.layers, constants(config), speed_at, np.ascontiguousarray(observations), outputs)
+    packed, encoded = pack(np.ascontiguousarray(genome), spec.layers), encoding(spec.features, constants(config))
+    _outputs(packed, spec.layers, encoded, np.ascontiguousarray(observations), outputs)
     return outputs
 
 

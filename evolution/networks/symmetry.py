@@ -8,14 +8,16 @@ serves in a bend to the right.
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
 
 import numpy as np
 
-from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec, gene_scales
+from evolution.networks.policy import KERNEL_1, KERNEL_2, SIDE_2, CnnSpec, MlpSpec, PolicySpec, gene_scales
 from evolution.search.space import Space, Symmetry
 from gridsim.car.vehicle import Action
 from gridsim.jit import freeze
+from gridsim.sensing.observation import FEATURES, encoding
 
 #: The mirror image of each action.
 MIRRORED_ACTIONS = np.array(
@@ -38,7 +40,8 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
     With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
     all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
-    Factors are 1, but -1 for weights of the steering angle and to the wheel, and 0 for those of a middle unit.
+    Factors are those of the features (`Feature.mirror`), -1 of weights to the wheel, elsewhere 1, and 0 for what would
+    be opposite to itself.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
@@ -47,8 +50,8 @@ def symmetry(spec: PolicySpec) -> Symmetry:
         if k == len(shapes) - 1:
             units = MIRRORED_ACTIONS if spec.actions == "discrete" else np.arange(2)
             sign[:, 1] = 1.0 if spec.actions == "discrete" else -1.0  # of the wheel
-        if k == 0 and isinstance(spec, MlpSpec) and spec.steering:
-            sign[n - 1] = -1.0
+        if k == 0 and isinstance(spec, MlpSpec):
+            sign[:n] *= encoding(spec.features).each(feature.mirror for feature in FEATURES)[:, None]
         images += [(at + inputs[:, None] * m + units).ravel(), at + n * m + units]
         signs.append(sign.ravel())
         at += (n + 1) * m
@@ -76,10 +79,8 @@ def _inputs(spec: PolicySpec) -> list[np.ndarray]:
             np.arange(dense)[::-1],
         ]
     assert isinstance(spec, MlpSpec)
-    rays = np.arange(RAYS)[::-1]
-    seen = [rays, rays + RAYS] if spec.motion else [rays]
-    others = np.arange(len(seen) * RAYS, spec.inputs)
-    return [np.concatenate([*seen, others]), *(np.arange(m)[::-1] for m in spec.hidden)]
+    parts = [np.arange(*ends)[::-1] for ends in itertools.pairwise(encoding(spec.features).first)]
+    return [np.concatenate(parts), *(np.arange(m)[::-1] for m in spec.hidden)]
 
 
 def _columns_reversed(rows: int, columns: int, channels: int) -> np.ndarray:

@@ -18,7 +18,7 @@ Parameters = type(None)  # a vehicle's constants are enough
 
 
 def parameters(vehicle: Any) -> None:
-    """None."""
+    """Those of a vehicle."""
 
 
 @leaf
@@ -31,18 +31,6 @@ def path_curvature(constants, speed, steering):
 
 
 @leaf
-def hold(model, constants, car):
-    """The curvature (1/m) of the path."""
-    return path_curvature(constants, car[SPEED], car[STEERING])
-
-
-@leaf
-def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
-    """Move for dt seconds."""
-    return advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
-
-
-@leaf
 def front_velocity(model, constants, car):
     """The centre of mass moves at the slip angle, and the front axle turns about it."""
     speed, curvature = car[SPEED], path_curvature(constants, car[SPEED], car[STEERING])
@@ -52,12 +40,8 @@ def front_velocity(model, constants, car):
 
 
 @leaf
-def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
-    """Move on an arc of constant curvature for dt seconds: exact for constant speed and steering.
-
-    Args: pose (m, m, heading as cosine and sine), speed m/s, acceleration m/s2, curvature 1/m, dt s.
-    Returns: (x, y, cosine, sine, speed, signed path length in m).
-    """
+def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
+    """Move on an arc of constant curvature: exact for constant speed and steering."""
     after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
     length = HALF * (speed + after) * dt
     # The heading changes by `length * curvature`, called turn here; the chord points along heading + slip + turn / 2.

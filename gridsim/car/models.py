@@ -1,16 +1,12 @@
 """The vehicle models: what moves a car within a control period. Each is a file like `single_track.py`, with
 
-Parameters, parameters   a vehicle's numbers as kernels read them: a type of its own, so that kernels are compiled
-for one model
-hold(model, constants, car)
-a number that holds for a control period, which `move` gets as `held`
-move(model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt)
-moves for dt seconds with the car's steering angle; pose (m, m, heading as cosine and
-sine), speed m/s, acceleration m/s2. Returns: (x, y, cosine, sine, speed, signed path
-length in m)
-front_velocity(model, constants, car)
-velocity (m/s) of the middle of the front axle, where the sensor is: (along the heading,
-to the left)
+* `Parameters` and `parameters(vehicle)`: a vehicle's numbers as kernels read them, a type of its own, so that kernels
+  are compiled for one model;
+* `move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt)`: moves for dt seconds with the
+  car's steering angle. Args: pose (m, m, heading as cosine and sine), speed m/s, acceleration m/s2; curvature (1/m) of
+  the kinematic model. Returns: (x, y, cosine, sine, speed, signed path length in m);
+* `front_velocity(model, constants, car)`: velocity (m/s) of the middle of the front axle, where the sensor is, along
+  the heading and to the left.
 """
 
 from __future__ import annotations
@@ -45,4 +41,4 @@ def _by_model(name: str) -> Any:
     return function
 
 
-hold, move, front_velocity = map(_by_model, ("hold", "move", "front_velocity"))
+move, front_velocity = _by_model("move"), _by_model("front_velocity")

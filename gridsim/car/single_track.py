@@ -41,8 +41,6 @@ class Numbers:
 class Parameters(NamedTuple):
     """A car's masses and tyres as kernels read them."""
 
-    front: np.float32  # m from the centre of mass to the front axle, lf
-    rear: np.float32  # m to the rear axle, lr
     height: np.float32  # m, of the centre of mass, h
     yaw_share: np.float32  # 1/m2, mass / moment of inertia about the vertical axis
     stiffness: np.float32  # 1/rad, C_f and C_r: cornering stiffness of an axle, per load
@@ -51,24 +49,12 @@ class Parameters(NamedTuple):
 
 def parameters(vehicle: Any) -> Parameters:
     """Those of a vehicle."""
-    return Parameters(
-        front=F(vehicle.wheelbase - vehicle.rear_axle),
-        rear=F(vehicle.rear_axle),
-        height=F(vehicle.mass_height),
-        yaw_share=F(vehicle.mass / vehicle.yaw_inertia),
-        stiffness=F(vehicle.cornering_stiffness),
-        friction=F(vehicle.friction),
-    )
+    yaw_share = vehicle.mass / vehicle.yaw_inertia
+    return Parameters(*map(F, (vehicle.mass_height, yaw_share, vehicle.cornering_stiffness, vehicle.friction)))
 
 
 @leaf
-def hold(model, constants, car):
-    """Nothing."""
-    return ZERO
-
-
-@leaf
-def move(model, constants, car, held, x, y, cosine, sine, speed, acceleration, dt):
+def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
     """Move for dt seconds, within which the speed keeps its sign; the yaw rate and the slip angle are the car's.
 
     The implicit midpoint rule, which is stable however stiff the tyres are at low speed.
@@ -76,7 +62,7 @@ def move(model, constants, car, held, x, y, cosine, sine, speed, acceleration, d
     after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
     acceleration = (after - speed) / dt
     yaw_rate, slip, steering = car[YAW_RATE], car[SLIP], car[STEERING]
-    front, rear = model.front, model.rear
+    front, rear = constants.front_axle, constants.rear_axle
     base = front + rear
     ahead = model.friction * model.stiffness * (GRAVITY * rear - acceleration * model.height)
     behind = model.friction * model.stiffness * (GRAVITY * front + acceleration * model.height)

@@ -4,7 +4,7 @@ Observation:
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
   between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
-  the steering angle as a share of 27 degrees.
+  the steering angle as a share of 27 degrees. `gridsim.sensing.observation` has these features.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
@@ -42,6 +42,7 @@ from gridsim.jit import U
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
+from gridsim.sensing.observation import OPTIONAL
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, LANE, SPEED, TERMINATES, TRUNCATES, End
 from gridsim.view.display import has_display
@@ -82,13 +83,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         traffic: int | None = None,
         observation: Literal["rays", "grid", "image"] = "rays",
         frames: int = 1,
-        motion: bool = False,
-        steering: bool = False,
         actions: Literal["discrete", "continuous"] = "discrete",
         render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         config: SimConfig | str | None = None,
+        **features: bool,
     ):
         """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
@@ -103,6 +103,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
             config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
+            features: which of `motion` and `steering` rays come with.
         """
         check_name(scenario)
         for name, value, known in (
@@ -114,8 +115,11 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
         if not 1 <= frames <= MAX_FRAMES or (frames > 1 and observation == "rays"):
             raise ValueError(f"frames must be 1 to {MAX_FRAMES}, and more than 1 only for grids, not {frames}")
-        if (motion or steering) and observation != "rays":
-            raise ValueError(f"motion and steering are only for rays; leave them out with observation={observation!r}")
+        if unknown := features.keys() - OPTIONAL:
+            raise ValueError(f"unknown option {min(unknown)!r}; features of rays are {' and '.join(OPTIONAL)}")
+        seen = tuple(name for name in OPTIONAL if features.get(name))
+        if seen and observation != "rays":
+            raise ValueError(f"{' and '.join(seen)}: only for rays; leave them out with observation={observation!r}")
         if traffic and not has_lanes(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
@@ -126,12 +130,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             "autoreset_mode": self.autoreset_mode,
         }
         traffic = default_traffic(scenario, self.config) if traffic is None else traffic
-        self.simulator = Simulator(num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
+        self.simulator = Simulator(num_envs, self.config, None, max_episode_steps, traffic, seen)
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
         self.render_mode = render_mode
         self._views: dict[Map, Renderer] = {}
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
-        self._observer = Observer(self.simulator, observation, frames, motion, steering)
+        self._observer = Observer(self.simulator, observation, frames)
         self.single_observation_space = self._observer.space
         continuous = actions == "continuous"
         self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32) if continuous else Discrete(len(Action))

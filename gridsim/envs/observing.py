@@ -7,7 +7,7 @@ from gymnasium.spaces import Box, Dict
 
 from gridsim.config import constants
 from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.sensing.observation import observations, speed_share
+from gridsim.sensing.observation import encoding
 from gridsim.simulator import Simulator
 
 _ALL = slice(None)
@@ -25,23 +25,19 @@ class Observer:
     Attributes: space, the observation space of one car.
     """
 
-    def __init__(self, simulator: Simulator, observation: str, frames: int, motion: bool, steering: bool):
+    def __init__(self, simulator: Simulator, observation: str, frames: int):
         self._simulator, self.config = simulator, simulator.config
-        self._motion, self._steering = motion, steering
-        self._constants = constants(self.config)
-        rays, slowest = self.config.sensors.rays, speed_share(self._constants, -self._constants.reverse_limit)
         self._observation = observation
         shape = 0 if observation == "rays" else (len(simulator), frames, CELLS, CELLS)
         self._stack = np.zeros(shape, dtype=np.uint8)
         image = Box(0, 255, (frames, CELLS, CELLS), dtype=np.uint8)
-        low = np.zeros((2 if motion else 1) * rays + 1 + steering, dtype=np.float32)
-        low[rays:] = -1.0
-        low[-1 - steering] = slowest
+        encoded = encoding(simulator.features, constants(self.config))
+        low = encoded.each(encoded.least)
         self.space: Box | Dict = Box(low, np.ones_like(low))
         if observation == "image":
             self.space = image
         elif observation == "grid":
-            self.space = Dict({"grid": image, "speed": Box(slowest, 1.0, (1,), dtype=np.float32)})
+            self.space = Dict({"grid": image, "speed": Box(low[-1:], np.ones(1, dtype=np.float32))})
 
     def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Add the newest frames of cars `which` [k], as all frames of those that have `begun` [k]."""
@@ -57,14 +53,12 @@ class Observer:
 
     def look(self, which: np.ndarray | slice = _ALL) -> Seen:
         """Observations of cars `which`, after `take`; the caller owns them."""
-        simulator = self._simulator
-        ranges, closing = simulator.ranges[which], simulator.closing[which] if self._motion else None
-        rays = observations(self._constants, ranges, closing, simulator.cars[which], self._steering)
+        numbers = self._simulator.observations[which]
         if self._observation == "rays":
-            return rays
+            return numbers.copy() if isinstance(which, slice) else numbers
         one = self._stack.shape[1] == 1
         image = self._grids(which)[:, None] if one else self._stack[which].copy()
-        return image if self._observation == "image" else {"grid": image, "speed": rays[:, -1:].copy()}
+        return image if self._observation == "image" else {"grid": image, "speed": numbers[:, -1:].copy()}
 
     def _grids(self, which: np.ndarray | slice) -> np.ndarray:
         # The table is not stored: copies of it would be writable, and kernels would be compiled again for them.

@@ -8,7 +8,7 @@ the lanes that come too close to it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -17,9 +17,19 @@ import numpy as np
 from gridsim.config import CROSSING_GAP
 from gridsim.jit import freeze, njit
 from gridsim.maps.network import Network
-from gridsim.maps.roads import Strips
+from gridsim.maps.roads import THICK_WALL, Strips
 
 Plan = tuple[Strips, Network]  # of a map: its drivable area and its lanes
+
+
+class Scenario(NamedTuple):
+    """A kind of road: its layout and its driving limitations (the paper's term)."""
+
+    layout: Callable[[np.random.Generator], Plan]
+    speed_interval: tuple[float, float]  # m/s, within which speed counts
+    traffic: int = 0  # default number of other cars
+    thinnest: float = THICK_WALL  # m, of its walls and parked cars
+
 
 LANE_STEP = 1.0  # m between points of a lane, at most
 FORKS = 3  # most successors of a lane: straight on, left and right

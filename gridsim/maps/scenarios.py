@@ -12,7 +12,7 @@ import numpy as np
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps import generators
-from gridsim.maps.generators import Scenario
+from gridsim.maps.lanes import Scenario
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import clearance_nodes, make_road

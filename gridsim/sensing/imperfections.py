@@ -85,14 +85,13 @@ def late_readings(history, car, ranges, closing):
         for k in range(steps):
             for r in range(ranges.shape[0]):
                 history.readings[k, 0, r] = ranges[r]
-                if closing is not None:
-                    history.readings[k, 1, r] = closing[r]
+            for r in range(closing.shape[0]):
+                history.readings[k, 1, r] = closing[r]
     kept = history.readings[I(car[STEPS]) % steps]
     for r in range(ranges.shape[0]):
         ranges[r], kept[0, r] = kept[0, r], ranges[r]
-    if closing is not None:
-        for r in range(ranges.shape[0]):
-            closing[r], kept[1, r] = kept[1, r], closing[r]
+    for r in range(closing.shape[0]):
+        closing[r], kept[1, r] = kept[1, r], closing[r]
 
 
 @leaf

@@ -1,57 +1,109 @@
-"""The observation of rays: what a car senses, as shares of what its sensor and the car can do.
+"""What a car sees: the features of an observation, encoded here alone.
 
-It is encoded here alone: the environment returns it, and policies, exported networks and the DQN read it.
+The environment returns them as shares of what the sensor and the car can do; policies, exported networks and the DQN
+turn these into the inputs of networks. A further feature is a row of `features`, and its place in `observe`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 
-from gridsim.config import Constants
-from gridsim.jit import ONE, exact, njit
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.jit import ONE, F, U, exact, freeze
 from gridsim.state import SPEED, STEERING
 
+SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; a perceptron of a small car less (`SimConfig.pace`)
+
+
+class Feature(NamedTuple):
+    """A part of an observation: values in SI units, which in a mirror are in reverse order."""
+
+    name: str
+    values: int
+    full: np.float32  # what the environment returns as 1
+    unit: np.float32  # what networks read as 1, without the shift
+    near: bool = False  # networks resolve small values best: they read v as 2 v / (v + unit) - 1
+    least: np.float32 = -ONE  # what the environment returns, at least
+    shift: float = 0.0  # added to what networks read
+    mirror: float = 1.0  # factor of the values in a mirror
+    sees: str = ""  # what a network sees that names it, as in `mlp:64+steering`; "": all networks see it
+
+
+def features(k: Constants) -> tuple[Feature, ...]:
+    """All features, in the order of an observation."""
+    speed, slowest = (k.speed_limit, SPEED_SCALE * k.pace), -k.reverse_limit / k.speed_limit
+    return (
+        Feature("ranges", int(k.rays), k.ray_range, F(8.0) * k.unit, near=True, least=F(0.0)),
+        Feature("motion", int(k.rays), *speed, sees="how fast the cars that rays hit approach"),
+        Feature("speed", 1, *speed, least=slowest, shift=-1.0),
+        Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
+    )
+
+
+USUAL = constants(SimConfig())
+FEATURES = features(USUAL)
+OPTIONAL = tuple(feature.name for feature in FEATURES if feature.sees)
+
+
+class Encoding(NamedTuple):
+    """How an observation is encoded, as kernels read it; arrays [features]."""
+
+    first: np.ndarray  # int64 [features + 1], where each one's values begin; it has none if it is not seen
+    near: np.ndarray  # bool
+    full: np.ndarray  # float32, as the others
+    least: np.ndarray
+    scale: np.ndarray  # for networks: full / unit, or where `near` the unit
+    shift: np.ndarray
+
+    def each(self, numbers: Iterable[float]) -> np.ndarray:
+        """A number [features] of each value's feature: float32 [values]."""
+        return np.repeat(np.array([*numbers], dtype=np.float32), np.diff(self.first))
+
+
+@lru_cache
+def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
+    """The encoding of an observation with the features of these names, and of those that all networks see."""
+    values = [each.values if each.name in names or not each.sees else 0 for each in features(k)]
+    rows = [
+        (each.near, each.full, each.least, each.unit if each.near else each.full / each.unit, each.shift)
+        for each in features(k)
+    ]
+    near, *others = np.array(rows, dtype=np.float32).T
+    return Encoding(freeze(np.cumsum([0, *values])), freeze(near > 0.0), *map(freeze, others))
+
 
 @exact
-def speed_share(constants, speed):
-    """A speed (m/s) as a share of the speed limit, at least that of the reverse limit."""
-    return min(max(speed / constants.speed_limit, -constants.reverse_limit / constants.speed_limit), ONE)
+def _put(encoding, feature, values, observation):
+    """Write the values of a feature, by its number, if it is seen."""
+    first, full, least = U(encoding.first[feature]), encoding.full[feature], encoding.least[feature]
+    for i in range(U(encoding.first[feature + 1]) - first):  # unsigned, or it would not be vector code
+        observation[first + i] = min(max(values[i] / full, least), ONE)
 
 
 @exact
-def encode(constants, ranges, closing, speed, steering, observation):
-    """Write the observation of ranges (m), closing speeds (m/s) or None, speed (m/s) and steering (rad).
-
-    Writes: observation float32 [rays + 1], [2 * rays + 1] with closing speeds; the steering angle where there is room.
-    """
-    rays = ranges.shape[0]
-    for r in range(rays):
-        observation[r] = min(ranges[r] / constants.ray_range, ONE)
-    last = rays
-    if closing is not None:
-        for r in range(rays):
-            observation[rays + r] = min(max(closing[r] / constants.speed_limit, -ONE), ONE)
-        last = 2 * rays
-    observation[last] = speed_share(constants, speed)
-    if last + 1 < observation.shape[0]:
-        observation[last + 1] = min(max(steering / constants.steering_limit, -ONE), ONE)
+def observe(simulation, car, world, ranges, closing, observation):
+    """Write the observation float32 [values] of a car, whose rays have these ranges (m) and closing speeds (m/s)."""
+    encoding = simulation.encoding
+    _put(encoding, 0, ranges, observation)
+    _put(encoding, 1, closing, observation)
+    _put(encoding, 2, (car[SPEED],), observation)
+    _put(encoding, 3, (car[STEERING],), observation)
 
 
-@njit(nogil=True)
-def _encode_all(constants, ranges, closing, cars, observations):
-    for i in range(ranges.shape[0]):
-        speeds = None if closing is None else closing[i]
-        encode(constants, ranges[i], speeds, cars[i, SPEED], cars[i, STEERING], observations[i])
-
-
-def observations(
-    constants: Constants, ranges: np.ndarray, closing: np.ndarray | None, cars: np.ndarray, steering: bool
-) -> np.ndarray:
-    """Observations of cars in states [n, CAR_FIELDS], with closing speeds if not None, and the angle of the wheels.
-
-    Args: ranges (m) and closing speeds (m/s), float32 [n, rays].
-    """
-    rays = ranges.shape[1]
-    encoded = np.empty((len(ranges), (1 if closing is None else 2) * rays + 1 + steering), dtype=np.float32)
-    _encode_all(constants, ranges, closing, cars, encoded)
-    return encoded
+@exact
+def normalise(encoding, observation, inputs):
+    """Write the inputs of a network on rays for an observation."""
+    for feature in range(encoding.full.shape[0]):
+        full, scale, shift = encoding.full[feature], encoding.scale[feature], encoding.shift[feature]
+        first, last = U(encoding.first[feature]), U(encoding.first[feature + 1])
+        if encoding.near[feature]:
+            for i in range(first, last):
+                reach = observation[i] * full
+                inputs[i] = F(2.0) * reach / (reach + scale) - ONE
+        else:
+            for i in range(first, last):
+                inputs[i] = observation[i] * scale + shift

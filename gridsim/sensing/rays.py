@@ -63,11 +63,11 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
 
     Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading, and velocity (m/s) along the
     heading and to the left; world as in `traffic.world`.
-    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s), along the ray, of
-    the sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
+    Writes: ranges float32 [rays] and, unless it is [0], closing float32 [rays]: the closing speed (m/s), along the ray,
+    of the sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
     """
-    if closing is not None:
-        closing[:] = ZERO
+    for r in range(closing.shape[0]):
+        closing[r] = ZERO
     length, breadth = constants.half_length, constants.half_width
     radius = math.sqrt(length * length + breadth * breadth)
     last_ray = I(ranges.shape[0] - 1)
@@ -111,6 +111,6 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
             leave = min(max(x0, x1), max(y0, y1))
             if enter <= leave and leave > ZERO and enter < ranges[r]:
                 ranges[r] = max(enter, ZERO)
-                if closing is not None:
+                if closing.shape[0] > 0:
                     # The box moves along its heading, its x axis.
                     closing[r] = velocity[0] * fan[0, r] + velocity[1] * fan[1, r] - world[j, SPEED] * ux

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gridsim import state as s
-from gridsim.car.kinematic import advance, path_curvature
+from gridsim.car.kinematic import move, path_curvature
 from gridsim.collision import boxes_touch
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
@@ -76,7 +76,7 @@ def way_to_ego_collision(network, drivers, car, ego):
         k = min(k, U(network.offsets[U(lane) + U(1)]) - U(2))
         aside = min(network.room[k], drivers.lane_change_speed * t - to_side(network, car[s.SHIFT]))
         px, py = shifted_right(network, k, k + U(1), to_side(network, aside))
-        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, ZERO, curvature, hop)
+        x, y, cosine, sine, speed, _ = move(None, drivers.ego, ego, curvature, x, y, cosine, sine, speed, ZERO, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
         if dx * dx + dy * dy > contact * contact:
             continue

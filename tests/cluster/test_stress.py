@@ -15,7 +15,7 @@ from cluster.store.champion import Champion
 from evolution.networks.policy import PolicySpec
 from gridsim.config import EpisodeConfig, SimConfig, VehicleConfig
 
-LEVELS = (*stress.STRESSES, *stress.OF_MODEL["kinematic"])
+LEVELS = (*stress.STRESSES, *stress.KINEMATIC)
 SHORT = SimConfig(episode=EpisodeConfig(target=10.0, time_limit=20.0))
 
 
@@ -57,5 +57,5 @@ def test_a_dynamic_vehicle_is_stressed_by_friction_and_mass_in_place_of_grip(dri
     names = [each.name for each in stress.stresses(dataclasses.replace(driver, sim=sim))]
     assert "lateral_grip" not in names
     assert {"friction", "mass"} <= set(names)
-    heavy = stress.OF_MODEL["single_track"][1].at(1.5, sim).vehicle
+    heavy = stress.DYNAMIC[1].at(1.5, sim).vehicle
     assert heavy.mass == pytest.approx(1.5 * sim.vehicle.mass)

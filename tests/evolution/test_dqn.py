@@ -14,8 +14,9 @@ from evolution.dqn.experience import NO_ACTION, UNITS, Experience, ages, empty, 
 from evolution.dqn.learner import RANDOM_SHARE, DqnConfig, DqnLearner, QNetwork, exploration, tanh
 from evolution.dqn.replay import Batch, Replay
 from evolution.networks import convnet
-from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
+from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
+from gridsim.sensing.observation import SPEED_SCALE
 from gridsim.state import End
 
 F = np.float32

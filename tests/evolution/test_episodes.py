@@ -19,26 +19,25 @@ from evolution.episodes.curriculum import Curriculum, CurriculumConfig
 from evolution.episodes.fitness import PACED_ENOUGH, scalar
 from evolution.episodes.rollout import EPISODE, RESULT, collect, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, act_on, normalise
+from evolution.networks.policy import PolicySpec, act_on
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.config import EpisodeConfig, SimConfig, constants
+from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.maps.map import starts_at
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
-from gridsim.sensing.observation import observations
+from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 from gridsim.simulator import Simulator
 from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
-K = constants(CONFIG)
 CARS = 8
 TARGET, STEPS = 1000.0, 1700
 
 
 def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
-    return act_on(spec, genome, observations(K, simulator.ranges, None, simulator.cars, False), CONFIG)
+    return act_on(spec, genome, simulator.observations, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -226,8 +225,8 @@ def cut_up(experience):
 
 def inputs_of(simulator):
     """What the environment shows of its one car, as a network with all inputs reads it."""
-    inputs = observations(K, simulator.ranges, simulator.closing, simulator.cars, True)[0]
-    normalise(K, 31, 62, inputs)
+    inputs = np.zeros(64, dtype=F)
+    normalise(encoding(OPTIONAL), simulator.observations[0], inputs)
     return inputs
 
 
@@ -240,7 +239,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
     row, table = 0, grid_table(CONFIG)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
-        simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars)
+        simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars, features=OPTIONAL)
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
         ranges, ends = simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
@@ -268,7 +267,7 @@ def test_a_network_reads_the_closing_speeds_that_the_environment_shows():
     episode["start"][0, 2:4] = math.atan2(world[0, SIN], world[0, COS]) + math.pi, 20.0
     genome = np.ones(spec.size, F)
     experience, _ = collect(spec, genome, [road], episode, np.zeros(1, F), np.zeros(1, np.uint64), CONFIG, world[None])
-    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1)
+    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1, features=OPTIONAL)
     simulator.reset(road, episode["start"], worlds=world[None])
     assert simulator.closing.max() == pytest.approx(45.0, abs=0.1)
     np.testing.assert_allclose(experience.observations[0] / 4096, inputs_of(simulator), rtol=0.0, atol=0.6 / 4096)

@@ -4,6 +4,7 @@ import itertools
 import math
 import subprocess
 import sys
+from typing import NamedTuple
 
 import numpy as np
 import onnx
@@ -23,13 +24,13 @@ from evolution.networks.export import to_onnx
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on, gene_scales, outputs_of
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.car.vehicle import Action
-from gridsim.config import SensorConfig, SimConfig, VehicleConfig, constants
+from gridsim.config import SensorConfig, SimConfig, VehicleConfig
 from gridsim.errors import GridSimError
 from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.sensing.observation import encode
+from gridsim.sensing.observation import OPTIONAL, SPEED_SCALE, Encoding, encoding, normalise, observe
+from gridsim.state import CAR_FIELDS, SPEED, STEERING
 
 F = np.float32
-K = constants(SimConfig())
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
 TEXTS = ["mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8", *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS))]
 
@@ -89,14 +90,20 @@ def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
     assert math.isnan(policy.squash(F(math.nan)))
 
 
+class Encoded(NamedTuple):
+    encoding: Encoding
+
+
 def test_what_the_network_sees():
-    inputs, ranges = np.zeros(33, dtype=F), np.linspace(0, 50, 31)
-    encode(K, ranges.astype(F), None, F(12.5), F(-0.1), inputs)
-    assert inputs == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
-    policy.normalise(K, 31, 31, inputs)
+    inputs, seen, ranges, car = np.zeros(33, F), np.zeros(33, F), np.linspace(0, 50, 31), np.zeros(CAR_FIELDS, F)
+    car[[SPEED, STEERING]] = 12.5, -0.1
+    encoded = encoding(("steering",))
+    observe(Encoded(encoded), car, None, ranges.astype(F), np.zeros(31, F), seen)
+    assert seen == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
+    normalise(encoded, seen, inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
-    assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
+    assert inputs[32] == pytest.approx(-0.2, abs=1e-6)
     assert inputs.min() == -1.0
 
 
@@ -109,7 +116,8 @@ def test_text_and_back(hidden, motion, steering, actions):
     text = f"mlp:{','.join(map(str, hidden))}{'+motion' * motion}{'+steering' * steering}{'+continuous' * pedal}"
     spec = PolicySpec.parse(text)
     assert str(spec) == text
-    assert spec == MlpSpec(tuple(hidden), motion=motion, steering=steering, actions=actions)
+    features = ("motion",) * motion + ("steering",) * steering
+    assert spec == MlpSpec(tuple(hidden), features=features, actions=actions)
     sizes = [32 + 31 * motion + steering, *hidden, 2 if pedal else 8]
     assert spec.layers.tolist() == sizes
     assert spec.size == sum((n + 1) * m for n, m in itertools.pairwise(sizes))
@@ -167,7 +175,7 @@ def test_forward_is_pytorchs(spec):
         ranges = np.minimum(rng.uniform(0, 70, (spec.frames, 31)), 50).astype(F)
         frames, speed = grids(grid_table(SimConfig()), ranges), F(rng.uniform(-3, 30))
         outputs = convolved(spec, genome, frames, speed)
-        seen = torch.from_numpy(np.append(frames / F(255.0), speed / policy.SPEED_SCALE - 1)[None].astype(F))
+        seen = torch.from_numpy(np.append(frames / F(255.0), speed / SPEED_SCALE - 1)[None].astype(F))
         network = QNetwork(spec, torch.device("cpu"))
         network.genome.copy_(torch.from_numpy(genome))
         expected = network(seen).numpy()[0].astype(float)
@@ -193,15 +201,16 @@ def test_a_cnns_gene_that_is_not_a_number_is_no_action():
 # --- Left-right symmetry ---------------------------------------------------------------------------------------------
 
 HIDDEN = st.lists(st.integers(4, 12), min_size=1, max_size=3).map(tuple)
+FEATURES = st.sets(st.sampled_from(OPTIONAL)).map(lambda names: tuple(name for name in OPTIONAL if name in names))
 
 
 def in_a_mirror(spec, observations):
     """What the same car would observe if left and right were exchanged."""
     seen = observations.copy()
     seen[:, :RAYS] = observations[:, RAYS - 1 :: -1]
-    if spec.motion:
+    if "motion" in spec.features:
         seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
-    if spec.steering:
+    if "steering" in spec.features:
         seen[:, -1] = -observations[:, -1]
     return seen
 
@@ -213,9 +222,7 @@ def test_left_and_right_are_exchanged_and_nothing_else():
 
 
 @settings(max_examples=40, derandomize=True)
-@given(
-    st.builds(MlpSpec, HIDDEN, motion=st.booleans(), steering=st.booleans(), actions=ACTIONS), st.integers(0, 1 << 40)
-)
+@given(st.builds(MlpSpec, HIDDEN, features=FEATURES, actions=ACTIONS), st.integers(0, 1 << 40))
 def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, seed):
     """Or the pedal is the same, and the wheel turns to the other side."""
     observations = np.random.default_rng(seed).random((60, spec.inputs)).astype(F)

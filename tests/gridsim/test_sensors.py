@@ -182,9 +182,10 @@ def parked(*poses):
 
 @njit
 def _cast(k, rays, side, poses, worlds, ranges):
+    closing = np.empty(ranges.shape[1], dtype=np.float32)
     for i in range(len(poses)):
         x, y, cosine, sine = poses[i]
-        cast_boxes(k, rays, side, side, x, y, cosine, sine, (F(0.0), F(0.0)), worlds[i], ranges[i], None)
+        cast_boxes(k, rays, side, side, x, y, cosine, sine, (F(0.0), F(0.0)), worlds[i], ranges[i], closing)
 
 
 @njit
@@ -324,7 +325,7 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
 def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, steering, heading, pace):
     """It comes towards us, drives away, stands, crosses. By finite differences of the middle of the front axle, which a
     turning car moves sideways."""
-    simulator = Simulator(1, CONFIG, traffic=1)
+    simulator = Simulator(1, CONFIG, traffic=1, features=("motion",))
     world = parked((116.0, 128.0, heading))
     world[0, SPEED] = pace
     simulator.closing[:] = 99.0

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pictures import crashes, small_map
 from scipy.integrate import solve_ivp
 
-from gridsim.car.kinematic import advance, path_curvature
+from gridsim.car.kinematic import move, path_curvature
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import EpisodeConfig, SimConfig, VehicleConfig, constants
 from gridsim.maps.map import sample_starts
@@ -33,7 +33,7 @@ actions = st.sampled_from(list(Action))
 
 def moved(car, acceleration, kappa, k=K):
     """A car (x, y, cosine, sine, speed) after a control period."""
-    return tuple(map(F, advance(k, *car, F(acceleration), kappa, k.dt)[:5]))
+    return tuple(map(F, move(None, k, None, kappa, *car, F(acceleration), k.dt)[:5]))
 
 
 @pytest.mark.parametrize("pedal", [-1.0, -0.3])
@@ -81,7 +81,7 @@ def test_a_period_is_the_oracles(speed, steering, heading, action):
     assert (float(acceleration), float(angle)) == pytest.approx(expected, abs=2e-6, rel=1e-6)
     kappa = path_curvature(K, F(speed), F(angle))
     start = (F(3.0), F(-2.0), F(math.cos(heading)), F(math.sin(heading)), F(speed))
-    x, y, cosine, sine, after, length = advance(K, *start, F(acceleration), kappa, K.dt)
+    x, y, cosine, sine, after, length = move(None, K, None, kappa, *start, F(acceleration), K.dt)
     looks = oracle.advance(CONFIG, (3.0, -2.0, heading), float(speed), float(angle), float(acceleration))
     # A speed limit reached within the period: the kernel's mean speed is that of its ends, the oracle's is exact.
     clipped = not -3.0 <= float(speed) + float(acceleration) * DT <= 30.0

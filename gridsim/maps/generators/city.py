@@ -11,8 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gridsim.maps.generators import Scenario
-from gridsim.maps.lanes import Path, Plan
+from gridsim.maps.lanes import Path, Plan, Scenario
 from gridsim.maps.squares import DIRECTIONS, Layout, components
 
 SIDE = 256.0  # m, of the torus

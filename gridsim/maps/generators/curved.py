@@ -11,8 +11,7 @@ import math
 import numpy as np
 
 from gridsim.jit import njit
-from gridsim.maps.generators import Scenario
-from gridsim.maps.lanes import Path, Plan, backwards, beside, lay_lanes, sample, strips_along
+from gridsim.maps.lanes import Path, Plan, Scenario, backwards, beside, lay_lanes, sample, strips_along
 
 SIDE = 256.0  # m, of the torus
 MARGIN = 20.0  # m, corners from the torus's sides, so that the road does not cross them

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.maps.generators import Scenario
-from gridsim.maps.lanes import Path, Plan, beside, lay_lanes, strips_along
+from gridsim.maps.lanes import Path, Plan, Scenario, beside, lay_lanes, strips_along
 
 WIDTH, HEIGHT = 1024.0, 128.0  # m, of the torus
 LANE_COUNT = 4

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from gridsim.maps.generators import Scenario
-from gridsim.maps.lanes import Plan
+from gridsim.maps.lanes import Plan, Scenario
 from gridsim.maps.squares import DIRECTIONS, Layout, Pieces, rotated
 from gridsim.maps.tiles import HALF_ROAD, LANE_WIDTH, TILE, TILES, tile_graph
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.maps.generators import Scenario
 from gridsim.maps.generators.roundabout import lay_tiles
-from gridsim.maps.lanes import Plan
+from gridsim.maps.lanes import Plan, Scenario
 from gridsim.maps.tiles import tile_graph
 
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
