@@ -5,12 +5,15 @@ import doctest
 
 import numpy as np
 import pytest
+from commands import refused
 
 import gridsim
 from cluster import api, evaluator
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
+from cluster.commands.cli import evolve_main
 from cluster.store.champion import held_out
 from cluster.store.checkpoint import CheckpointError, save
+from cluster.store.checkpoint import load as load_checkpoint
 from cluster.store.folder import RunError, RunFolder, read_config
 from evolution.episodes.rollout import trajectory
 from evolution.networks import convnet
@@ -64,6 +67,28 @@ def test_load_drive_evaluate(which, shown, request, tmp_path):
     assert figures == evaluate(made, "curved", episodes=8)
     assert figures["episodes"] == 8
     assert figures["distance_m"] > 0.0
+
+
+def test_a_run_of_pedal_and_wheel_is_kept_continued_and_refused_as_a_start_for_actions(
+    pedaller, here, monkeypatch, capsys
+):
+    kind = dataclasses.replace(SMALL, actions="continuous")
+    evolve(dataclasses.replace(kind, generations=1), folder="r")
+    made, _ = evolve(kind, folder="r", resume=True)
+    assert (made.sha256, made.policy) == (pedaller.sha256, "mlp:64+steering+continuous")
+    assert read_config(here / "r/config.json")[0] == kind
+    assert load_checkpoint(here / "r/elites.npz")[1]["policy"] == made.policy
+    assert '"outputs":["pedal","wheel"]' in (here / "r/drive.html").read_text()
+    for flags in ("", "--policy mlp:64+steering"):
+        (line,) = refused(evolve_main, monkeypatch, capsys, "--init", "r", *flags.split())
+        assert line.endswith("--init r has continuous actions, this run discrete ones")
+    for flags in ("--config r/config.json --actions discrete", "--policy mlp:8+continuous"):
+        (line,) = refused(evolve_main, monkeypatch, capsys, *flags.split())
+        assert line.endswith("sets pedal and wheel; give --actions continuous, too")
+    (line,) = refused(
+        evolve_main, monkeypatch, capsys, *["--resume", "r", "--generations", "9", "--actions", "discrete"]
+    )
+    assert "--actions discrete contradicts the run's continuous; leave it out" in line
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import base64
 import json
 import re
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,14 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
         assert angle == following[STEERING], "the greatest output is what it did"
 
 
+def test_pedal_and_wheel_are_shown_from_the_middle():
+    _, drive, _, shown = shown_drives()
+    commands = np.random.default_rng(2).uniform(-1, 1, (len(drive.cars), 2)).astype(np.float32)
+    packed = replace(shown, drive=replace(drive, outputs=commands)).packed()
+    assert (packed["outputs"], packed["middle"]) == (["pedal", "wheel"], 50)
+    assert pytest.approx(0.5 + 0.5 * commands * [1, -1], abs=1e-5) == channels(packed)[-2:].T / 65535  # left is left
+
+
 def shown_drives():
     """Ways to show a drive of a minute among 3 cars: as an elite's, and as the champion's."""
     champion = load_champion(CHAMPION)
@@ -113,6 +122,11 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
         browser.run("choose(1)")
         browser.wait_for("document.querySelectorAll('#outputs .chosen').length === 1")
         assert browser.faults == []
+        browser.run("drives[1].channels[drives[1].outputChannel].fill(16384)")  # a quarter of a bar
+        browser.run("drives[1].outputs = ['pedal', 'wheel']; drives[1].middle = 50; choose(1); panel(drives[1], 0)")
+        bar = "$('outputs').querySelector('.bar div').style"
+        assert browser.run(f"[{bar}.marginLeft, {bar}.width].map(parseFloat).map(Math.round)") == [25, 25]
+        assert browser.run("document.querySelectorAll('#outputs .chosen').length") == 0
         assert {url for url in browser.requests if not url.startswith("data:")} == {path.as_uri()}
 
 
