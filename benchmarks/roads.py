@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gridsim.car.collision import boxes_touch, collides
+from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit

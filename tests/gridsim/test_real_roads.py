@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, osm, street
 
-from gridsim.car.collision import boxes_touch, collides
+from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
