@@ -89,4 +89,5 @@ def test_the_commands_of_the_readme_run_and_then_the_examples_of_all_pages(root:
     for program in examples(root).values():
         for text, small in IN_PYTHON.items():
             program = program.replace(text, small)
-        finish("python", "-c", program, cwd=tmp_path, timeout=300)
+        (tmp_path / "page.py").write_text(program)  # a file, which kernels come from
+        finish("python", "page.py", cwd=tmp_path, timeout=300)
