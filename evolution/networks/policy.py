@@ -25,7 +25,7 @@ from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 RAYS = SensorConfig.rays
 ACTIONS = 8
 MAX_GENES = 1_000_000
-COMMAND_SCALE = 0.3  # of the genes of the layer of pedal and wheel; with 1 both would mostly be at their limits
+COMMAND_SCALE = 0.5  # of the genes of the layer of pedal and wheel; with 1 both would mostly be at their limits
 
 _FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # of a specification
 

@@ -151,7 +151,7 @@ def test_genes_are_as_large_as_he_et_al_have_them():
     assert gene_scales(PolicySpec.parse("cnn:8,16,32@1")) == pytest.approx(expected)
     assert (gene_scales(PolicySpec.parse("mlp:6,7")) == 1.0).all()
     pedal = gene_scales(PolicySpec.parse("mlp:6,7+continuous"))
-    assert pedal == pytest.approx(np.repeat([1.0, 0.3], [33 * 6 + 7 * 7, 8 * 2]))
+    assert pedal == pytest.approx(np.repeat([1.0, 0.5], [33 * 6 + 7 * 7, 8 * 2]))
 
 
 # --- Convolutional networks ------------------------------------------------------------------------------------------
