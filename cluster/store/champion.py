@@ -34,7 +34,7 @@ GONE = ("apart", "kerb")  # former parameters of traffic, which champions of the
 
 @dataclass(frozen=True)
 class Champion:
-    """A genome and what is needed to run it."""
+    """A genome and what is needed to run it. Champions are equal if all of that is, the genome bit for bit."""
 
     genome: np.ndarray  # float32 [genes]
     policy: str  # its network, such as `mlp:6,7`
@@ -44,6 +44,14 @@ class Champion:
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Champion):
+            return NotImplemented
+        return vars(self) | {"genome": self.sha256} == vars(other) | {"genome": other.sha256}
+
+    def __hash__(self) -> int:
+        return hash(self.sha256)
 
     @property
     def sha256(self) -> str:

@@ -56,8 +56,10 @@ def test_load_drive_evaluate(which, shown, request, tmp_path):
     made = request.getfixturevalue(which)
     made.save(tmp_path / "champion.npz")
     loaded = load_champion(tmp_path / "champion.npz")
-    assert loaded.genome.tobytes() == made.genome.tobytes()
-    assert loaded.sim == made.sim
+    others = [dataclasses.replace(made, genome=-made.genome), dataclasses.replace(made, traffic=3)]
+    assert loaded == made
+    assert loaded not in others
+    assert len({loaded, made, *others}) == 3
     assert repr(loaded) == f"<Champion {shown} genes, sha256 {made.sha256[:8]}>"
     assert load_champion(str(tmp_path)).sha256 == made.sha256  # a run's folder
     env = loaded.make_env()
