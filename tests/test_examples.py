@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from commands import finish, running
 
+import gridsim
+
 
 @pytest.mark.e2e
 def test_cma_es_learns_to_drive(root: Path, tmp_path: Path) -> None:
@@ -13,6 +15,18 @@ def test_cma_es_learns_to_drive(root: Path, tmp_path: Path) -> None:
     done = finish("python", str(root / "examples/pycma.py"), "--minutes", "3", cwd=tmp_path)
     assert float(re.findall(r"roads (\d+)%", done.stdout)[-1]) > 50.0
     assert (tmp_path / "champion.npz").exists()
+
+
+@pytest.mark.e2e
+def test_map_elites_makes_an_atlas_of_drivers(root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ribs")
+    command = ("python", str(root / "examples/map_elites.py"), "--generations", "20")
+    first, second = re.findall(r"^generation \d+: ([\d.]+) of 100", finish(*command, cwd=tmp_path).stdout, re.MULTILINE)
+    assert 30.0 < float(second) > float(first)
+    assert (tmp_path / "atlas/atlas.png").stat().st_size > 20_000
+    drivers = sorted((tmp_path / "atlas").glob("*.npz"), key=lambda file: float(file.name.split("mps")[0]))
+    slow, fast = (gridsim.evaluate(gridsim.load_champion(file), episodes=8) for file in (drivers[0], drivers[-1]))
+    assert slow["speed_mps"] + 2.0 < fast["speed_mps"]
 
 
 def test_the_search_finds_the_middle_of_a_sphere(root: Path, tmp_path: Path) -> None:
