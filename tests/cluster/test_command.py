@@ -142,9 +142,9 @@ def test_the_policy_suits_observation_and_traffic(policy, settings):
 
 def test_evolution_s_default_budget_is_of_car_steps():
     usual, short = EvolveSettings(), EvolveSettings(generations=4)
-    assert (usual.generations, usual.car_steps) == (0, 30_000_000)
+    assert (usual.generations, usual.car_steps) == (0, 60_000_000)
     assert (short.generations, short.car_steps) == (4, 0)  # whoever says how long means it
-    assert usual.ended({"solved": False, "generation": 1, "car_steps": 30_000_000})
+    assert usual.ended({"solved": False, "generation": 1, "car_steps": 60_000_000})
     assert not usual.ended({"solved": False, "generation": 10**9, "car_steps": 29_999_999})
     assert usual.ended({"solved": True, "generation": 0, "car_steps": 0})
     assert short.ended({"solved": False, "generation": 4, "car_steps": 0})
@@ -300,7 +300,7 @@ def test_each_learners_rows_are_said_in_words():
     dqn = DqnSettings("curved", car_steps=0, episodes=20_000)
     assert progress.row_in_words(dqn, 2, row) == "distance 1,812 m, 50% succeed  7.1 m/s  loss 0.012  2 k updates"
     assert progress.progress(dqn, 2, row) == (0.5, "10000/20000 episodes")
-    both = EvolveSettings("curved", car_steps=30_000_000, generations=10**15)
+    both = EvolveSettings("curved", car_steps=60_000_000, generations=10**15)
     assert progress.progress(both, 2, ROW)[1] == "12.3/30 M car-steps"
     assert progress.progress(dataclasses.replace(both, car_steps=0), 2, ROW) == (0.0, "2 generations")
 
