@@ -300,7 +300,7 @@ def test_each_learners_rows_are_said_in_words():
     dqn = DqnSettings("curved", car_steps=0, episodes=20_000)
     assert progress.row_in_words(dqn, 2, row) == "distance 1,812 m, 50% succeed  7.1 m/s  loss 0.012  2 k updates"
     assert progress.progress(dqn, 2, row) == (0.5, "10000/20000 episodes")
-    both = EvolveSettings("curved", car_steps=60_000_000, generations=10**15)
+    both = EvolveSettings("curved", car_steps=30_000_000, generations=10**15)
     assert progress.progress(both, 2, ROW)[1] == "12.3/30 M car-steps"
     assert progress.progress(dataclasses.replace(both, car_steps=0), 2, ROW) == (0.0, "2 generations")
 
