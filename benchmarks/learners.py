@@ -27,7 +27,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from gridsim.envs.sb3 import SB3VecEnv
-from gridsim.maps.scenarios import HELD_OUT_SEED
+from gridsim.maps.parts import HELD_OUT_SEED
 
 ID = "gridsim:GridSim/Curved-v0"  # the module's name lets SubprocVecEnv's processes import it
 IMPORT = "import time, gymnasium; a = time.perf_counter(); import gridsim; print(time.perf_counter() - a)"

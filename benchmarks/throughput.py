@@ -46,7 +46,8 @@ from evolution.search.breeding import Kind, Mutation, breed
 from gridsim.config import constants
 from gridsim.jit import njit
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.sensing.observation import encoding, normalise
 from gridsim.state import DISTANCE
 

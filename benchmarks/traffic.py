@@ -36,7 +36,8 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import Network, wrapped
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.state import CAR_FIELDS as FIELDS
 from gridsim.state import COS, LANE, SIN, SPEED, X, Y
 from gridsim.traffic.behaviour import drivers

@@ -19,7 +19,7 @@ from evolution.networks.policy import Actions, PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import TRAINING_SEED, seed_of_map
+from gridsim.maps.parts import TRAINING_SEED
 
 MAPS = 128  # training maps from which episodes are drawn
 MAX_EPISODES = 10_000
@@ -123,9 +123,7 @@ class Evaluator:
 
     def _drive(self, genomes: np.ndarray, episodes: Episodes, comfort: bool = False) -> np.ndarray:
         members = Generation(np.zeros((0, self.genes), np.float32), recipes(0)).and_copies(self._checked(genomes))
-        scenario = self._settings.scenario
-        names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
-        shared = str(self.spec), episodes.rows, episodes.worlds, names, self._sim
+        shared = str(self.spec), episodes.rows, episodes.worlds, self._maps.names(episodes.maps), self._sim
         task = Task(*shared, members.parents, members.key, members.mutation, comfort)
         return self._pool.run(Outcome(task, members.recipes)).results
 

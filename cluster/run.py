@@ -36,6 +36,7 @@ from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VALIDATION_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
+from gridsim.maps.parts import held_out_place
 
 WAIT_FOR_MLFLOW_S = 30.0  # for the id of MLflow's run, which summary.json holds
 
@@ -235,6 +236,7 @@ class Session:
             "solved": learning.solved,
             "training_s": learning.history[-1]["wall_s"],
             **{f"best_{name}": row[name] for name in ("car_steps", "wall_s")},
+            "held_out_place": held_out_place(settings.scenario, self.maps.get(HELD_OUT_SEEDS.start)),
             "held_out": summarise(driven.results[0], sim.episode.control_period),
         }
         checkpoint.write_json(path / SUMMARY, self.summary)

@@ -18,13 +18,12 @@ from evolution.networks.policy import CONTINUOUS, Actions, Observation, PolicySp
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
+from gridsim.maps.parts import is_map_file
 from gridsim.maps.scenarios import (
     REGISTRY,
-    build,
     check_name,
     default_traffic,
     has_lanes,
-    is_map_file,
     speed_interval,
 )
 from gridsim.step import parameters
@@ -37,7 +36,7 @@ LEAST_GROUP = 16  # members of a group, so that its best are good
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
 
-ROADS = f"{', '.join(REGISTRY)}, or a map file (docs/maps.md)."
+ROADS = f"{', '.join(REGISTRY)}, or a file of a map or a road, or a folder of them (docs/roads.md)."
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -73,8 +72,8 @@ class RunSettings(ABC):
     follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
-        for name in ("scenario", "sim"):  # absolute: config.json may be read from another folder
-            if names_file(value := getattr(self, name)):
+        for name, is_file in (("scenario", is_map_file), ("sim", names_file)):
+            if is_file(value := getattr(self, name)):  # absolute: config.json may be read from another folder
                 object.__setattr__(self, name, os.path.abspath(value))
         if self.traffic == -1:
             object.__setattr__(self, "traffic", default_traffic(self.scenario, self.simulator()))
@@ -131,7 +130,7 @@ class RunSettings(ABC):
         check_name(self.scenario)
         sim = self.simulator()
         if is_map_file(self.scenario):
-            build(self.scenario, 0, sim)  # cached, so that it is read once
+            speed_interval(self.scenario, sim)  # reads all of its files
         self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and not has_lanes(self.scenario):
             raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")

@@ -17,7 +17,8 @@ from PIL import Image
 from cluster.report.film import picture, record
 from cluster.store.champion import load_champion
 from evolution.episodes.starts import lane_starts
-from gridsim.maps.scenarios import HELD_OUT_SEED, build
+from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import build
 from gridsim.view.render import Renderer
 
 SIZE = (480, 360)

@@ -51,7 +51,8 @@ from cluster.tracking.tracking import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import has_lanes, is_map_file, label
+from gridsim.maps.parts import is_map_file
+from gridsim.maps.scenarios import has_lanes, label
 from gridsim.reference import errors
 
 
@@ -274,8 +275,8 @@ def _send_missing(console: Console, run: RunFolder, meta: Mapping[str, Any], wor
 def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, settings, path = session.summary, session.run.settings, session.run.path
-    where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
-    console.print(held_out_table(f"The champion on {where}", summary["held_out"], session.learning.sim.episode.target))
+    title = f"The champion on {summary['held_out_place']}"
+    console.print(held_out_table(title, summary["held_out"], session.learning.sim.episode.target))
     steps, solved = count(summary[f"{settings.step_name}s"], settings.step_name), summary["solved"]
     reached = [name for name in settings.extendable if 0 < getattr(settings, name) <= summary[name]]
     longer = " ".join(f"{as_flag(name)} {2 * summary[name]}" for name in reached)

@@ -28,7 +28,7 @@ from cluster.store.checkpoint import WriteError
 from cluster.text import as_argument
 from cluster.workers.cores import cores
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import HELD_OUT_SEED
+from gridsim.maps.parts import HELD_OUT_SEED
 
 T = TypeVar("T")
 FAILED, WRONG_USE = 1, 2  # exit codes

@@ -16,7 +16,9 @@ from cluster.settings import IN_WORDS
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.network import junctions
-from gridsim.maps.scenarios import build, check_name, has_lanes, is_map_file, label
+from gridsim.maps.parts import divided, files_of, is_map_file
+from gridsim.maps.real.load import described, split_crop
+from gridsim.maps.scenarios import build, check_name, has_lanes, label
 
 MAP = "gridsim-map"
 
@@ -27,7 +29,8 @@ class MapFlags:
 
     example: ClassVar[str] = "gridsim-map town.osm --crop 52.473,13.44,400 --output town.png"
     file: tyro.conf.Positional[str]
-    """OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad, Lanelet2; a picture or a map's YAML; or a scenario."""
+    """OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad, Lanelet2; a picture or a map's YAML; a folder of these; or
+    a scenario."""
     crop: Annotated[str, IN_WORDS] = ""
     """Read only a square: LAT,LON,METRES of its middle and its side; X,Y,METRES where a file is in metres."""
     output: Annotated[str, IN_WORDS] = ""
@@ -38,17 +41,36 @@ def _map() -> int:
     flags = parse(MapFlags, MAP, sys.argv[1:])
     if flags.output and Path(flags.output).suffix != ".png":
         raise GridSimError(f"--output {flags.output}: a picture is a .png")
-    name, config = flags.file + (f"@{flags.crop}" if flags.crop else ""), SimConfig()
+    name = flags.file + (f"@{flags.crop}" if flags.crop else "")
     check_name(name)
+    if flags.crop and split_crop(name)[1] is None:
+        raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")
+    files = files_of(name)
+    if flags.output and len(files) > 1:
+        raise GridSimError(f"--output: name one of the {len(files)} files, not all")
+    for file in files:
+        _describe(file)
+    if len(files) > 1:
+        for what, part in zip(("learn on", "choose the champion on", "judge it on"), divided(name), strict=True):
+            print(f"to {what}: {', '.join(Path(file).name for file in part)}")
+    if flags.output:
+        from cluster.report.pictures import road_map
+
+        road_map(build(name, 0), Path(flags.output), label(name))
+        print(f"picture: {short_path(Path(flags.output))}")
+    if is_map_file(name):
+        print(f"train a driver: gridsim-evolve --scenario {shlex.quote(name)}")
+    return 0
+
+
+def _describe(name: str) -> None:
+    """Print what was read of a file."""
+    config = SimConfig()
     here = build(name, 0, config)
     road, network = here.road, here.network
     if is_map_file(name) and has_lanes(name):
-        from gridsim.maps.real.load import described, split_crop
-
-        if flags.crop and split_crop(name)[1] is None:
-            raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")
         found = described(name, config)
-        print(f"{flags.file}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
+        print(f"{split_crop(name)[0]}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
         print(f"  the map's lower left corner is the file's x {found.origin[0]:g} m, y {found.origin[1]:g} m")
     if len(network.steps):
         side = "right" if network.hand > 0.0 else "left"
@@ -56,14 +78,6 @@ def _map() -> int:
     else:
         print(f"no lanes, {len(here.starts)} starts")
     print(f"{road.width:g} m x {road.height:g} m; speed counts from {road.speed_low:.1f} to {road.speed_high:.1f} m/s")
-    if flags.output:
-        from cluster.report.pictures import road_map
-
-        road_map(here, Path(flags.output), label(name))
-        print(f"picture: {short_path(Path(flags.output))}")
-    if is_map_file(name):
-        print(f"train a driver: gridsim-evolve --scenario {shlex.quote(name)}")
-    return 0
 
 
 map_main = partial(main, MAP, _map)

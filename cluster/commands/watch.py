@@ -32,7 +32,8 @@ from cluster.store.steps import read_elites
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
-from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
+from gridsim.maps.parts import is_map_file
+from gridsim.maps.scenarios import build, check_name, default_traffic, label
 from gridsim.state import End
 from gridsim.traffic.world import spawn
 from gridsim.view.drive import Recorder, drive, read_drive, replay

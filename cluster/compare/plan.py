@@ -26,7 +26,8 @@ from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
 from gridsim.config import names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import REGISTRY, is_map_file, label
+from gridsim.maps.parts import is_map_file
+from gridsim.maps.scenarios import REGISTRY, label
 from gridsim.packages import DISTRIBUTION
 
 COMPARISON = "comparison.json"

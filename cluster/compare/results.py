@@ -22,7 +22,7 @@ from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import HELD_OUT_SEED
+from gridsim.maps.parts import HELD_OUT_SEED
 from gridsim.reference import Series, error_series, errors
 from gridsim.state import poses_of
 

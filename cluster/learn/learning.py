@@ -27,7 +27,6 @@ from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import seed_of_map
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
@@ -170,9 +169,7 @@ class Learning(ABC):
 
     def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, tuple[tuple[str, int], ...], SimConfig]:
         """The first fields of a task, which both kinds have; pools know maps by scenario and seed."""
-        scenario = self.settings.scenario
-        names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
-        return self.settings.policy, episodes.rows, episodes.worlds, names, self.sim
+        return self.settings.policy, episodes.rows, episodes.worlds, self.maps.names(episodes.maps), self.sim
 
     def drive(
         self, stage: str, genomes: np.ndarray, episodes: Episodes, train: Callable[[], bool] = lambda: False

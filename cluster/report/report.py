@@ -13,7 +13,8 @@ from cluster.store.champion import Champion
 from cluster.store.folder import CURVES, PAGE, TRAJECTORY, RunFolder
 from evolution.episodes.starts import Episodes
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import is_map_file, label
+from gridsim.maps.parts import is_map_file
+from gridsim.maps.scenarios import label
 from gridsim.state import DISTANCE
 
 ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
@@ -36,7 +37,7 @@ def write_report(
     pictures.curves(history, path / CURVES, settings.step_name)
     drive = film.record(champion, road_map, start, limit, episodes.worlds[0])
     where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
-    title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
+    title = f"{label(road_map.name)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
     pictures.trajectory(road_map, drive.cars, path / TRAJECTORY, title)
     shown = [page.Shown("champion", "champion", drive)]
     for k in (np.unique(np.geomspace(1, len(elites), ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():

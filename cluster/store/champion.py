@@ -26,7 +26,8 @@ from evolution.networks.policy import CnnSpec, PolicySpec, act_on
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import HELD_OUT_SEED, build, default_traffic
+from gridsim.maps.parts import HELD_OUT_SEED, seed_of_map
+from gridsim.maps.scenarios import build, default_traffic
 
 SIM_FORMAT = 2  # of a champion's `sim`; in the first one, patience and progress were per control step
 GONE = ("apart", "kerb")  # former parameters of traffic, which champions of the first format may hold
@@ -202,6 +203,7 @@ def held_out(
     if not 0 <= traffic <= MAX_TRAFFIC:
         raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     seeds = range(seed, seed + max(len(HELD_OUT_SEEDS), episodes // 8))
-    roads = {k: build(name, k, champion.sim) for k in seeds}
-    chosen = spread_starts(roads.__getitem__, seeds, episodes, traffic, champion.sim)
-    return chosen, [roads[k] for k in chosen.maps]
+    same = {k: seed_of_map(name, k) for k in seeds}
+    roads = {k: build(name, k, champion.sim) for k in dict.fromkeys(same.values())}
+    chosen = spread_starts(lambda k: roads[same[k]], seeds, episodes, traffic, champion.sim)
+    return chosen, [roads[same[k]] for k in chosen.maps]

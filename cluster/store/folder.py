@@ -26,7 +26,8 @@ from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, ELITES, HISTO
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import is_map_file, label, map_digest
+from gridsim.maps.parts import is_map_file
+from gridsim.maps.scenarios import label, map_digest
 from gridsim.packages import DISTRIBUTION
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"

@@ -29,8 +29,9 @@ from evolution.search.breeding import Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
 from gridsim.maps.map import blank, sample_starts
+from gridsim.maps.parts import is_map_file
 from gridsim.maps.roads import clearances
-from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
+from gridsim.maps.scenarios import REGISTRY, build, default_traffic
 from gridsim.sensing.imperfections import imperfections_of
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn

@@ -21,7 +21,7 @@ from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
+from gridsim.maps.parts import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
 from gridsim.state import LANE, TRAFFIC_FIELDS, End
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps

@@ -40,7 +40,8 @@ from gridsim.envs.episodes import Episodes
 from gridsim.envs.observing import Observer, row
 from gridsim.jit import U
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, has_lanes
+from gridsim.maps.parts import TRAINING_SEED
+from gridsim.maps.scenarios import check_name, default_traffic, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.sensing.observation import OPTIONAL
 from gridsim.simulator import Simulator

@@ -13,8 +13,9 @@ from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import U, njit
 from gridsim.maps.map import Map, starts_at
+from gridsim.maps.parts import is_map_file, seed_of_map
 from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import build, is_map_file, seed_of_map
+from gridsim.maps.scenarios import build
 from gridsim.state import TRAFFIC_FIELDS
 from gridsim.traffic.world import spawn
 
@@ -46,13 +47,16 @@ class Episodes:
     ):
         """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed."""
         self.scenario, self.traffic, self.config = scenario, traffic, config
-        if isinstance(maps, int) and is_map_file(scenario):
-            maps = [build(scenario, map_seed, config)] * min(maps, 1)
         given = [] if isinstance(maps, int) else maps
-        self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [each.seed for each in maps]
+        if isinstance(maps, int):
+            self._seeds = list(dict.fromkeys(seed_of_map(scenario, map_seed + k) for k in range(maps)))
+        else:
+            self._seeds = [each.seed for each in maps]
         self._own = {each.seed: each for each in given}  # the maps of `_seeds` that were built so far
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
+        if not given and is_map_file(scenario):
+            self._map(self._seeds[0])  # so that a file that cannot be read is told at once
         if len(set(self._seeds)) < len(self._seeds):
             raise ValueError("maps that are given need different seeds, by which episodes name them")
         self.keys = np.zeros(cars, dtype=np.uint64)

@@ -27,6 +27,8 @@ class Map:
     torus: bool = True  # whether leaving on one side means entering on the other
     # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
+    # bool [n], on which of a file's steps between the network's points, or starts, episodes begin; empty: on all.
+    begins: np.ndarray = field(default_factory=lambda: freeze(np.zeros(0, dtype=bool)))
 
     @property
     def size(self) -> np.ndarray:
@@ -45,6 +47,13 @@ class Map:
         length[self.network.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
+    @cached_property
+    def starts_mileage(self) -> np.ndarray:
+        """`mileage` of where episodes may begin."""
+        if not len(self.begins):
+            return self.mileage
+        return freeze(np.concatenate([[0.0], np.cumsum(np.diff(self.mileage) * self.begins)]))
+
     def magnified(self) -> Map:
         """The map with a metre for each unit (`SimConfig.unit`), for pictures: they look alike for cars of any size."""
         if self.road.unit == 1.0:
@@ -57,11 +66,11 @@ class Map:
     @property
     def nbytes(self) -> int:
         """Bytes of its arrays."""
-        return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts))
+        return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts, self.begins))
 
     def __getstate__(self) -> dict[str, Any]:
-        """State without the cached arc length."""
-        return {name: part for name, part in vars(self).items() if name != "mileage"}
+        """State without the cached arc lengths."""
+        return {name: part for name, part in vars(self).items() if "mileage" not in name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickle with read-only arrays: for writable ones, Numba would compile the kernels again."""
@@ -112,7 +121,7 @@ def _starts_at(points, mileage, shares, starts):
 
 
 def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5], at rest, at these shares float64 [n] in [0, 1) of the total length of the lanes.
+    """Starts float32 [n, 5], at rest, at these shares float64 [n] in [0, 1) of the length of lanes to begin on.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
     without lanes, shares index `Map.starts`.
@@ -120,7 +129,7 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     if not len(road_map.network.steps):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(road_map.network.points, road_map.mileage, shares, starts)
+    _starts_at(road_map.network.points, road_map.starts_mileage, shares, starts)
     return starts
 
 

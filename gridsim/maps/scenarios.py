@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import re
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
 import numpy as np
 
-from gridsim.config import SimConfig, names_file
+from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps import generators
 from gridsim.maps.lanes import Scenario
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
+from gridsim.maps.parts import PICTURES, YAMLS, file_of, files_of, is_map_file, seed_of_map, seeds_of_files, with_seed
 from gridsim.maps.roads import clearance_nodes, make_road
 
-PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp", ".yaml", ".yml")  # files of maps without lanes
 REAL_TRAFFIC = 8  # default number of other cars on real roads
-# First seeds of the maps for training, for the choice of the champion, and for the final report and nothing else.
-TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = 0, 1_000_000, 2_000_000
 
 _FOUND = {
     file.name: import_module(f"{generators.__name__}.{file.name}").SCENARIO
@@ -32,14 +33,11 @@ REGISTRY: dict[str, Scenario] = dict(
 )
 
 
-def is_map_file(name: str) -> bool:
-    """Whether a scenario's name is the path of a map file (`gridsim.maps.files`)."""
-    return names_file(name)
-
-
 def has_lanes(name: str) -> bool:
     """Whether a scenario has lanes, and so may have traffic: all but pictures and YAML files."""
-    return not is_map_file(name) or Path(name).suffix.lower() not in PICTURES
+    if not is_map_file(name):
+        return True
+    return all(Path(file).suffix.lower() not in PICTURES + YAMLS for file in files_of(name))
 
 
 def check_name(name: str) -> None:
@@ -53,18 +51,18 @@ def label(name: str) -> str:
     """A short name of a scenario: for a file, its name without what says its format."""
     if not is_map_file(name):
         return name
+    if glob.has_magic(name) and not Path(name).exists():
+        name = re.sub(r"[*?\[\]]", "", "-".join(Path(name).parts[-2:]))
     return re.sub(r"(\.net)?(\.\w+)(\.gz)?(@.*)?$", "", Path(name).name)
 
 
 def map_digest(name: str) -> str:
     """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
-    if has_lanes(name):
-        from gridsim.maps.real.load import file_digest
-
-        return file_digest(name)
     from gridsim.maps import files
+    from gridsim.maps.real.load import file_digest
 
-    return files.map_digest(name)
+    digests = [(file_digest if has_lanes(file) else files.map_digest)(file) for file in files_of(name)]
+    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
 
 
 def default_traffic(name: str, config: SimConfig | None = None) -> int:
@@ -79,13 +77,14 @@ def speed_interval(name: str, config: SimConfig) -> tuple[float, float]:
     if name in REGISTRY:
         low, high = REGISTRY[name].speed_interval
         return low * config.pace, high * config.pace
-    road = build(name, 0, config).road
-    return float(road.speed_low), float(road.speed_high)
+    return _interval_of_files(name, map_digest(name), config)
 
 
-def seed_of_map(name: str, seed: int) -> int:
-    """The seed of the map that `build` returns: always 0 for a map file, which has only one map."""
-    return 0 if is_map_file(name) else seed
+@lru_cache
+def _interval_of_files(name: str, _digest: str, config: SimConfig) -> tuple[float, float]:
+    """The speed interval of map files with this digest: from the lowest to the highest of all."""
+    roads = [build(name, seed, config).road for seed in seeds_of_files(name)]
+    return min(float(road.speed_low) for road in roads), max(float(road.speed_high) for road in roads)
 
 
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
@@ -98,13 +97,12 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     if seed < 0:
         raise GridSimError(f"a seed must be 0 or more, not {seed}")
     if is_map_file(name):  # imported here, because workers never read files
-        if has_lanes(name):
-            from gridsim.maps.real.load import load_road
-
-            return load_road(name, config)
         from gridsim.maps.files import load_map
+        from gridsim.maps.real.load import load_road
 
-        return load_map(name, config)
+        file = file_of(name, seed)
+        road_map = (load_road if has_lanes(file) else load_map)(file, config)
+        return with_seed(road_map, seed_of_map(name, seed), file == name)
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes = spec.layout(rng)

@@ -11,7 +11,8 @@ from cluster.commands.cli import evaluate_main
 from cluster.compare.results import series
 from cluster.store.champion import load_champion
 from gridsim.config import VehicleConfig
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.reference import ACCELERATION, BRAKING, LATERAL, Series, arc_length, error_series, profile, top_speed
 from gridsim.reference import errors as errors_of
 

@@ -214,7 +214,7 @@ def test_bad_files(tmp_path, monkeypatch, name, data, says):
 
 def test_without_sumo_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(sumo, "find_spec", lambda name: None)
-    with pytest.raises(GridSimError, match=r"pip install 'gridsim\[roads\]'"):
+    with pytest.raises(GridSimError, match=r'pip install "gridsim-driving\[roads\]"'):
         build(written(tmp_path, "a.osm", osm([street((0.0, 0.0), (201.0, 0.0))])), 0)
 
 

@@ -19,7 +19,8 @@ from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.state import ALONG, COS, LANE, LANE_TIMER, PERMIT, SIN, SPEED, SPEED_FACTOR, STEERING, X, Y
 from gridsim.traffic.behaviour import drivers, idm, step_traffic
 from gridsim.traffic.world import spawn

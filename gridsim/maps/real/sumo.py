@@ -15,8 +15,9 @@ import numpy as np
 from gridsim.errors import GridSimError
 from gridsim.maps.real.content import Element, parse
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_repeats
+from gridsim.packages import DISTRIBUTION
 
-INSTALL = "pip install 'gridsim[roads]'"
+INSTALL = f'pip install "{DISTRIBUTION}[roads]"'
 TIME_LIMIT = 120.0  # s
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {

@@ -1,0 +1,119 @@
+"""Which maps are for training, for the choice of the champion, and for the final report and nothing else.
+
+Maps are asked for by seeds, which are in three parts. A generated road has a new map for each seed; the files of a
+folder are divided among the parts; and on a single file, episodes of each part begin in regions of their own.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from gridsim.config import names_file
+from gridsim.errors import GridSimError
+from gridsim.maps.map import Map
+
+TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_000_000  # of each part
+PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
+YAMLS = (".yaml", ".yml")
+ROADS = (".osm", ".xodr", ".xml", ".gz")
+_TURNS = 0, 1, 2, 0, 0  # the parts of files in turn, and of regions along a row
+_REGIONS = 10  # along the longer side of a map
+
+
+def is_map_file(name: str) -> bool:
+    """Whether a scenario's name is a path: of a map file, of a folder of them, or a pattern such as maps/*.osm."""
+    return names_file(name) or glob.has_magic(name) or os.path.isdir(name)
+
+
+def files_of(name: str) -> list[str]:
+    """The map files of a path, in order. Raises: GridSimError for a folder or a pattern with fewer than three."""
+    if os.path.isdir(name):
+        files = [os.path.join(name, file) for file in sorted(os.listdir(name))]
+        kinds = ROADS + (YAMLS if any(file.endswith(YAMLS) for file in files) else PICTURES)
+        files = [file for file in files if Path(file).suffix.lower() in kinds]
+    elif glob.has_magic(name) and not os.path.exists(name):
+        files = sorted(glob.glob(name))
+    else:
+        return [name]
+    if len(files) < len(FIRST_SEEDS):
+        raise GridSimError(
+            f"{name}: {len(files)} map files; it needs 3 or more, one to learn on, one to choose the champion on, and "
+            "one to judge it on"
+        )
+    return files
+
+
+def divided(name: str) -> list[list[str]]:
+    """The map files of a path, of each part. They do not depend on a run's seed, so that runs can be compared."""
+    files = files_of(name)
+    if len(files) == 1:
+        return [files] * len(FIRST_SEEDS)
+    turns = np.resize(_TURNS, len(files))
+    return [[file for file, turn in zip(files, turns, strict=True) if turn == part] for part in range(len(FIRST_SEEDS))]
+
+
+def part_of(seed: int) -> int:
+    """The part of a map's seed: 0 training, 1 the choice of the champion, 2 the final report."""
+    return sum(seed >= first for first in FIRST_SEEDS) - 1
+
+
+def seed_of_map(name: str, seed: int) -> int:
+    """The smallest seed of the map that a seed has: that seed itself for generated roads."""
+    if not is_map_file(name):
+        return seed
+    part = part_of(seed)
+    return FIRST_SEEDS[part] + (seed - FIRST_SEEDS[part]) % len(divided(name)[part])
+
+
+def seeds_of_files(name: str) -> list[int]:
+    """The seeds of all maps of a path."""
+    return [first + k for first, files in zip(FIRST_SEEDS, divided(name), strict=True) for k in range(len(files))]
+
+
+def file_of(name: str, seed: int) -> str:
+    """The file that the map of a seed is read from."""
+    part = part_of(seed)
+    return divided(name)[part][seed_of_map(name, seed) - FIRST_SEEDS[part]]
+
+
+@lru_cache(maxsize=16)
+def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
+    """The map of a file with a seed; episodes begin in the regions of the seed's part, if the file is alone.
+
+    On a map so small that a part would have no region, they begin anywhere in all parts.
+    """
+    regions = _regions(road_map) if alone else None
+    if regions is None:
+        return replace(road_map, seed=seed)
+    begins = regions == part_of(seed)
+    if len(road_map.network.steps):
+        return replace(road_map, seed=seed, begins=begins)
+    return replace(road_map, seed=seed, starts=road_map.starts[begins], begins=begins)
+
+
+def _regions(road_map: Map) -> np.ndarray | None:
+    """The part of each step of a lane, or else of each start, int [n]; None if a part has none."""
+    places = road_map.starts[:, :2]
+    if len(road_map.network.steps):
+        points = road_map.network.points
+        places = (points[1:] + points[:-1]) / 2.0
+    low, extent = places.min(axis=0), np.ptp(places, axis=0).max()
+    column, row = ((places - low) * (_REGIONS / max(extent, 1e-6))).astype(int).T
+    parts = np.take(_TURNS, (column + 2 * row) % len(_TURNS))
+    return parts if len(np.unique(parts)) == len(FIRST_SEEDS) else None
+
+
+def held_out_place(name: str, held_out: Map) -> str:
+    """Where the drives of the final report are, in words, given one of its maps."""
+    if not is_map_file(name):
+        return "held-out drives"
+    files = [Path(file).name for file in divided(name)[2]]
+    if files_of(name) != [name]:
+        return f"held-out maps: {', '.join(files[:3])}" + (f" and {len(files) - 3} more" if len(files) > 3 else "")
+    return "this map, from regions of its own" if len(held_out.begins) else "this map, from the same starts"
