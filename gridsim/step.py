@@ -60,18 +60,21 @@ def simulations_on(road_maps: Sequence[Map], config: SimConfig, features: tuple[
 def visit_cells(road: Road) -> int:
     """Number of visit cells of a map."""
     columns, rows = int(road.width * road.per_m), int(road.height * road.per_m)
-    return columns // VISIT_CELL * (rows // VISIT_CELL)
+    return int(road.ways) * (columns // VISIT_CELL * (rows // VISIT_CELL))
 
 
 @leaf
-def visit_cell(road, x, y):
-    """Index of the visit cell that contains a point of the torus."""
+def visit_cell(road, x, y, cosine, sine):
+    """Index of the visit cell of a car on the torus; with `Road.ways` 2, driving back has a cell of its own."""
     scale = _VISIT_SCALE * road.per_m
     columns = I(road.width * scale)
     rows = I(road.height * scale)
     column = min(max(I(x * scale), I(0)), columns - I(1))
     row = min(max(I(y * scale), I(0)), rows - I(1))
-    return row * columns + column
+    cell = row * columns + column
+    if road.ways > ONE and F(0.93) * cosine + F(0.37) * sine < ZERO:  # few streets run at right angles to that
+        cell += rows * columns
+    return cell
 
 
 @leaf
@@ -84,7 +87,7 @@ def place(simulation, start, car, visits):
     car[COS], car[SIN] = math.cos(start[2]), math.sin(start[2])
     car[SPEED], car[STEERING] = start[3], start[4]
     visits[:] = F(-1e6)
-    cell = visit_cell(road, car[X], car[Y])
+    cell = visit_cell(road, car[X], car[Y], car[COS], car[SIN])
     car[CELL], car[FRESH] = F(cell), ONE
     visits[cell] = ZERO
 
@@ -166,7 +169,7 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     car[STEPS] += ONE
     odometer = car[ODOMETER] + abs(moved)
     car[ODOMETER] = odometer
-    cell = visit_cell(road, x, y)
+    cell = visit_cell(road, x, y, cosine, sine)
     if F(cell) != car[CELL]:
         gap = odometer - visits[cell]
         car[CELL] = F(cell)

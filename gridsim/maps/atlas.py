@@ -19,7 +19,7 @@ class Atlas(NamedTuple):
     lanes: Network  # the arrays of all maps' networks
     bounds: np.ndarray  # int64 [maps + 1, 4], where each map's part of the field, points, lanes and crossings begin
     sides: np.ndarray  # uint32 [maps, 2], columns and rows
-    sizes: np.ndarray  # float32 [maps, 8], the other fields of `Road`, and `Network.hand`
+    sizes: np.ndarray  # float32 [maps, 9], the other fields of `Road`, and `Network.hand`
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
@@ -43,8 +43,8 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
 @njit
 def road_of(atlas: Atlas, m: int) -> Road:
     """Map m of an atlas."""
-    field, sides, sizes = atlas.field[atlas.bounds[m, 0] : atlas.bounds[m + 1, 0]], atlas.sides[m], atlas.sizes[m]
-    return Road(field, sides[0], sides[1], sizes[0], sizes[1], sizes[2], sizes[3], sizes[4], sizes[5], sizes[6])
+    field, sides, s = atlas.field[atlas.bounds[m, 0] : atlas.bounds[m + 1, 0]], atlas.sides[m], atlas.sizes[m]
+    return Road(field, sides[0], sides[1], s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
 
 
 @njit
@@ -67,5 +67,5 @@ def network_of(atlas: Atlas, m: int) -> Network:
         lanes.boxes[here[2] : there[2]],
         atlas.sizes[m, 0],
         atlas.sizes[m, 1],
-        atlas.sizes[m, 7],
+        atlas.sizes[m, 8],
     )

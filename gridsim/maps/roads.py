@@ -38,6 +38,7 @@ class Road(NamedTuple):
     thinnest: np.float32  # units; no ray passes a wall that is at least as thick as this
     unit: np.float32  # m, a power of two
     per_m: np.float32  # units
+    ways: np.float32  # 2: driving back over the same ground counts as new distance; 1: it does not
 
 
 class Strips(NamedTuple):
@@ -183,7 +184,9 @@ def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
     return nodes
 
 
-def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, unit: float = 1.0) -> Road:
+def make_road(
+    nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, unit: float = 1.0, ways: int = 1
+) -> Road:
     """The Road of a clearance field [rows, columns]; speeds m/s; thinnest, of its walls, in units as the field is."""
     rows, columns = nodes.shape
     return Road(
@@ -197,4 +200,5 @@ def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: 
         thinnest=F(thinnest),
         unit=F(unit),
         per_m=F(1.0 / unit),
+        ways=F(ways),
     )

@@ -38,7 +38,7 @@ MAX_NODES = 1 << 24  # of the field: 4 square km
 SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
 SLOWEST_LIMIT = 15 / 3.6  # m/s; what is below, no road has: a file has it in a wrong unit
-SPEEDS = 0.35, 0.85  # the interval within which speed counts, as shares of the usual limit
+SPEEDS = 0.45, 0.95  # the interval within which speed counts, as shares of the usual limit
 FASTEST = 27.0  # m/s, of the interval
 
 
@@ -166,7 +166,8 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
     order = np.argsort(limits)
     usual = float(limits[order][np.searchsorted(np.cumsum(lengths[order]), lengths.sum() / 2)])
     low, high = (min(share * usual, FASTEST * share / SPEEDS[1]) for share in SPEEDS)
-    road = make_road(prepared.nodes, (low, high), 2.0 * HALF_WALL)
+    # On roads that end, one turns and drives back.
+    road = make_road(prepared.nodes, (low, high), 2.0 * HALF_WALL, ways=2)
     paces = (limits / usual * TRAFFIC_PACE * (low + high)).astype(np.float32)
     return Map(name, 0, road, Strips.of(), make_network(network, road, config, paces))
 
