@@ -16,7 +16,8 @@ from gridsim.jit import njit
 from gridsim.maps.real import content, load, sumo
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, default_traffic, label
-from gridsim.state import COS, LANE, SHIFT, SIN, SPEED, X, Y
+from gridsim.simulator import Simulator
+from gridsim.state import COS, DISTANCE, LANE, SHIFT, SIN, SPEED, X, Y
 from gridsim.traffic.behaviour import drivers, step_traffic
 from gridsim.traffic.world import spawn
 
@@ -132,6 +133,26 @@ def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
     overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, nobody, 6000)
     assert (overlaps, off) == (0, 0)
     assert stood < 600
+
+
+def test_driving_back_on_the_other_lane_is_new_distance(tmp_path):
+    """Roads end, so a car has to turn; on the same lane a second lap of 80 m still counts nothing."""
+    here = build(written(tmp_path, "a.xml", commonroad(both_ways(300.0))), 0)
+    x, y = here.network.points[20]
+    ahead = here.network.points[21] - here.network.points[20]
+    heading = np.arctan2(ahead[1], ahead[0])
+    simulator = Simulator(1, SIM)
+    simulator.reset(here, np.array([[x, y, heading, 8.0, 0.0]], dtype=np.float32))
+    simulator.max_steps, distances = 10_000, []
+    for turned in (False, True, False):
+        simulator.cars[0, [X, Y]] = np.array([x, y]) + turned * 42.0 * np.array([np.cos(heading), np.sin(heading)])
+        simulator.cars[0, [COS, SIN]] = np.array([np.cos(heading), np.sin(heading)]) * (-1.0 if turned else 1.0)
+        simulator.cars[0, SPEED] = 8.0
+        for _ in range(40):
+            simulator.step(np.array([[0.0, 0.0]]))
+        distances.append(simulator.cars[0, DISTANCE])
+    assert np.diff(distances, prepend=0.0)[:2] == pytest.approx(distances[0], rel=0.2)
+    assert distances[2] - distances[1] < 0.2 * distances[0]
 
 
 def test_lanes_join_and_lie_on_the_road(tmp_path):
