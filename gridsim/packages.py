@@ -12,7 +12,7 @@ DISTRIBUTION = "gridsim-driving"
 #: What is imported of each extra of pyproject.toml.
 _EXTRAS = {
     "evolve": "docstring_parser imageio_ffmpeg matplotlib mlflow onnx onnxruntime pygame ray rich torch tyro",
-    "roads": "sumo",
+    "roads": "osmium sumo",
     "view": "pygame",
 }
 #: A file in each package, by which it is told from a user's file or folder of the same name.

@@ -21,7 +21,7 @@ from gridsim.maps.map import Map
 TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_000_000  # of each part
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
 YAMLS = (".yaml", ".yml")
-ROADS = (".osm", ".xodr", ".xml", ".gz")
+ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
 _TURNS = 0, 1, 2, 0, 0  # the parts of files in turn, and of regions along a row
 _REGIONS = 10  # along the longer side of a map
 

@@ -205,6 +205,20 @@ def test_crop(tmp_path):
         build(f"{name}@51.0,9.0,200", 0)
 
 
+def test_packed_openstreetmap_is_the_same(tmp_path):
+    osmium = pytest.importorskip("osmium")
+    name = written(tmp_path, "a.osm", osm(CROSSING))
+    with osmium.SimpleWriter(str(tmp_path / "b.osm.pbf")) as writer:
+        for thing in osmium.FileProcessor(name):
+            writer.add(thing)
+    packed = tmp_path / "b.osm.pbf"
+    points = [build(file, 0).network.points for file in (str(packed), name)]
+    assert np.abs(points[0] - points[1]).max() < 0.05  # it has seven digits of a degree
+    (tmp_path / "c.osm.pbf").write_bytes(packed.read_bytes()[:-40])
+    with pytest.raises(GridSimError, match="truncated or damaged"):
+        build(str(tmp_path / "c.osm.pbf"), 0)
+
+
 BOMB = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "cc"><!ENTITY d "&b;&b;">]><osm>&d;</osm>'
 
 

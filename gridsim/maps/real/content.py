@@ -5,14 +5,17 @@ from __future__ import annotations
 import gzip
 import io
 import re
+import tempfile
 import zlib
 from pathlib import Path
 from xml.etree import ElementTree
 
 from gridsim.errors import GridSimError
+from gridsim.packages import DISTRIBUTION
 from gridsim.reading import MAX_BYTES, read_bytes, shown
 
 Element = ElementTree.Element
+INSTALL = f'pip install "{DISTRIBUTION}[roads]"'
 FORMATS = "OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad and Lanelet2"
 
 
@@ -29,8 +32,30 @@ def read_content(path: Path) -> bytes:
     if not data.strip():
         raise GridSimError(f"{path}: the file is empty")
     if b"OSMHeader" in data[:64]:
-        raise GridSimError(f"{path}: a packed map; convert it: osmium cat {path.name} -o {path.name[:-4]}")
+        return _from_pbf(path)
     return data
+
+
+def _from_pbf(path: Path) -> bytes:
+    """OpenStreetMap's packed form as XML."""
+    try:
+        import osmium
+    except ImportError:
+        raise GridSimError(f"{path}: a .pbf needs osmium: {INSTALL}") from None
+    with tempfile.TemporaryDirectory() as folder:
+        unpacked = Path(folder) / "all.osm"
+        try:
+            with osmium.SimpleWriter(str(unpacked)) as writer:
+                for k, thing in enumerate(osmium.FileProcessor(str(path))):
+                    writer.add(thing)
+                    if k % 100_000 == 0 and unpacked.stat().st_size > MAX_BYTES:
+                        break
+        except RuntimeError as error:
+            raise GridSimError(f"{path}: truncated or damaged: {shown(str(error))}") from None
+        if unpacked.stat().st_size > MAX_BYTES:
+            text = f"more than {MAX_BYTES >> 20} MiB when unpacked; cut a part out: osmium extract -b W,S,E,N"
+            raise GridSimError(f"{path}: {text}")
+        return unpacked.read_bytes()
 
 
 def parse(path: Path, data: bytes) -> Element:

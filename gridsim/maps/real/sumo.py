@@ -13,11 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from gridsim.errors import GridSimError
-from gridsim.maps.real.content import Element, parse
+from gridsim.maps.real.content import INSTALL, Element, parse
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_repeats
-from gridsim.packages import DISTRIBUTION
 
-INSTALL = f'pip install "{DISTRIBUTION}[roads]"'
 TIME_LIMIT = 120.0  # s
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
