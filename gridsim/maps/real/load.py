@@ -134,7 +134,9 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     for lane in road.lanes.values():
         lane.left, lane.right = lane.left - shift, lane.right - shift
     used = {lane.junction for lane in road.lanes.values()}
-    outlines = [outline - origin for key, outline in road.junctions.items() if key in used]
+    # What of a junction lies beyond the lanes that are left would come in again on the other side of the torus.
+    inside = (np.clip(road.junctions[key], low - OUTSIDE, high + OUTSIDE) for key in road.junctions if key in used)
+    outlines = [outline - origin for outline in inside]
     hand = hand_of(road.lanes)
     lanes, conflicts = shaped(road.lanes, gap, size)
     nodes = clearance_of(lanes, outlines, size)
