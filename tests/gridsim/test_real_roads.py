@@ -177,6 +177,14 @@ def test_way_under_a_bridge_is_left_out(tmp_path):
     assert np.ptp(points[:, 0]) > 200.0 > np.ptp(points[:, 1])
 
 
+def test_ring_keeps_both_directions(tmp_path):
+    angles = np.linspace(0.0, 2.0 * np.pi, 25)
+    ring = list(zip(120.0 * np.cos(angles), 120.0 * np.sin(angles), strict=True))
+    network = build(written(tmp_path, "ring.osm", osm([street(*ring[:13]), street(*ring[12:24], ring[0])])), 0).network
+    lengths = (np.diff(network.offsets) - 1) * network.steps
+    assert lengths.sum() == pytest.approx(2 * 2 * np.pi * 120.0, rel=0.03)
+
+
 def test_sharp_turns_are_no_ways_of_traffic(tmp_path):
     turn = [[(200.0, 0.0), (201.0, 0.0), (200.0, 0.1)], [(200.0, -3.2), (204.0, 1.6), (200.0, 3.2)]]
     lanes = [*both_ways(200.0), (turn[0], turn[1])]

@@ -13,6 +13,7 @@ from gridsim.maps.real.description import Lane, RealRoad, groups_of
 
 TIGHTEST = 3.5  # m, the least radius of a turn that traffic drives
 TURN = 1.75  # rad, 100 degrees: what may be turned within an arc of that radius
+NEARLY = 0.75  # of the largest component's length
 APART = 2.5  # m of height between two ways, at least, of which one is above the other
 END = 3.0  # m from a lane's end, within which lanes meet and do not cross
 
@@ -151,11 +152,14 @@ def _components(keys: list[str], pairs: list[tuple[str, str]], connection: str) 
 
 
 def _largest(lanes: dict[str, Lane], connection: str) -> set[str]:
-    """The largest component (m) of the graph of successors and changes of lanes."""
+    """The largest component (m) of the graph of successors and changes of lanes, and others that are nearly as large.
+
+    On a ring, each direction is a component.
+    """
     keys = list(lanes)
     if not keys:
         return set()
     onward = [(key, s) for key, lane in lanes.items() for s in (*lane.successors, lane.left_lane, lane.right_lane)]
     label = _components(keys, onward, connection)
-    largest = np.bincount(label, [lane.length for lane in lanes.values()]).argmax()
-    return {key for key, own in zip(keys, label, strict=True) if own == largest}
+    lengths = np.bincount(label, [lane.length for lane in lanes.values()])
+    return {key for key, own in zip(keys, label, strict=True) if lengths[own] >= NEARLY * lengths.max()}
