@@ -1,4 +1,4 @@
-"""What is closed by walls on a picture's road: the surroundings of a drawing, and dead ends.
+"""What is closed by walls on a picture's road: the surroundings of a drawing, dead ends, and narrow places.
 
 All lengths are in units (`SimConfig.unit`).
 """

@@ -245,14 +245,14 @@ def _warnings(
     """What a user should know of a map, each a sentence after its name.
 
     Args: share of road on the picture's border, and whether what is wall may be the road; share of the road that is
-    closed because it is dead ends; the road's length, and that within which the same ground does not count again (m).
+    closed as dead ends; the road's length, and that within which the same ground does not count again (m).
     """
     if file.ignored:
         yield f"has keys in its YAML that mean nothing here: {', '.join(file.ignored)}"
     if closed >= MOST_CLOSED:
         yield (
-            f"loses {closed:.0%} of its road, which is closed by walls: dead ends in which the car cannot turn round. "
-            "Give starts in its YAML to keep it as it is drawn"
+            f"loses {closed:.0%} of its road, which is closed by walls: dead ends in which the car cannot turn round, "
+            "and what is narrow. Give starts in its YAML to keep it as it is drawn"
         )
     if length <= 1.05 * revisit:  # 5 % for the error of the estimate
         yield (
