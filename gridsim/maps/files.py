@@ -1,7 +1,7 @@
 """Maps from files: a picture in which bright pixels are road, or the YAML form of ROS's map_server with a picture.
 
 Unknown pixels are wall, and so is everything outside the picture. World coordinates have their origin at the picture's
-lower left corner; a file's own coordinates are shifted by its `origin`.
+lower left corner; a file's own coordinates are turned and shifted by its `origin`.
 
 A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
@@ -9,15 +9,16 @@ in the file, or poses on the ridge of the free space, heading along it in both d
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import io
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,17 @@ from PIL import Image
 
 from gridsim.config import FILE_SPEEDS, LIMITS, SimConfig
 from gridsim.errors import GridSimError
+from gridsim.maps.closing import NODE
 from gridsim.maps.map import Map, without_lanes
-from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
+from gridsim.maps.raster import (
+    HALF_WALL,
+    OUTSIDE,
+    check_starts,
+    find_starts,
+    has_room,
+    road_length,
+    signed_clearance,
+)  # fmt: skip
 from gridsim.maps.roads import CELLS_PER_UNIT
 from gridsim.reading import number, read_bytes, read_yaml, shown
 
@@ -38,10 +48,13 @@ KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thre
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
 # Limits, from and to.
-RESOLUTION = (0.01, 1.0)  # m a pixel
+RESOLUTION = (0.001, 1.0)  # m a pixel
 PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
 SHORTEST_SIDE = 16  # units
-MOST_BORDER = 0.5  # share of road on a picture's border from which the picture is taken to be inverted
+UNKNOWN = 205  # of 255, the grey of unknown pixels in maps that robots save
+ALIKE = 0.8  # `difflib.SequenceMatcher.ratio` of an unknown key and a known one from which it is a slip of the pen
+MOST_BORDER = 0.5  # share of road on a picture's border from which the road is looked for inside
+MOST_CLOSED = 0.05  # share of the road that may be closed without a word
 
 
 class MapWarning(UserWarning):
@@ -54,18 +67,22 @@ class MapFile:
 
     image: Path
     resolution: float = 1.0 / PIXELS_PER_M  # m a pixel
-    origin: tuple[float, float] = (0.0, 0.0)  # m, the picture's lower left corner in the file's own coordinates
+    # x, y (m) of the picture's lower left corner in the file's own coordinates, and their heading (rad) along its rows
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     negate: bool = False  # whether dark pixels are road
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
+    unknown: bool = False  # whether pixels of the grey UNKNOWN are none, however dark that is
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: Sequence[Sequence[float]] = ()
     speed: tuple[float, float] | None = None  # m/s, the speed interval; FILE_SPEEDS, for small cars less
+    ignored: Sequence[str] = ()  # keys of its YAML that mean nothing here
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:
     """The map of a file; the same object as long as the file does not change.
 
-    Warns (MapWarning) when it is built, if the road is very short or the picture seems inverted. Raises: GridSimError.
+    Warns (MapWarning) when it is built: of what is ignored or closed, if the road is very short, and if the picture
+    seems inverted. Raises: GridSimError.
     """
     return _load(os.path.abspath(name), map_digest(name), config or SimConfig())
 
@@ -81,7 +98,7 @@ def read_map_file(path: Path) -> MapFile:
     """Read and check a map's YAML; for a picture alone, use defaults."""
     suffix = path.suffix.lower()
     if suffix in PICTURES:
-        return MapFile(path)
+        return MapFile(path, unknown=suffix == ".pgm")
     if suffix not in YAMLS:
         raise GridSimError(f"{path}: a map is a .yaml file of map_server's form or a picture ({', '.join(PICTURES)})")
     values = read_yaml(path)
@@ -102,21 +119,23 @@ def _checked(path: Path, values: Any) -> MapFile:
     """The MapFile of a YAML's values. Raises: ValueError without the file's name."""
     if not isinstance(values, dict):
         raise ValueError(f"a map's YAML is a mapping with image and resolution, not {shown(values)}")
-    unknown = [key for key in values if key not in KEYS]
-    if unknown:
-        raise ValueError(f"unknown key {shown(unknown[0])}; there are: {', '.join(KEYS)}")
+    ignored = [str(key) for key in values if key not in KEYS]
+    for key in ignored:
+        if like := difflib.get_close_matches(key, KEYS, 1, ALIKE):
+            raise ValueError(f"unknown key {shown(key)}; did you mean {like[0]}?")
     if "image" not in values or "resolution" not in values:
         raise ValueError("it needs an image, and its resolution (m a pixel)")
     mode, negate, starts = values.get("mode", "trinary"), values.get("negate", 0), values.get("starts", [])
     if mode not in ("trinary", "scale"):
-        raise ValueError(f"mode must be trinary or scale (both have the same effect), not {shown(mode)}")
+        raise ValueError(f"mode must be trinary or scale, not {shown(mode)}")
     if negate not in (0, 1):
         raise ValueError(f"negate must be true or false, not {shown(negate)}")
     if not isinstance(starts, list):
         raise ValueError(f"starts must be a list of [x, y, heading], not {shown(starts)}")
-    x, y, yaw = _numbers(values.get("origin", [0, 0, 0]), "origin's x, y (m) and yaw (rad)", PLACE, PLACE, TURN)
-    if abs(yaw) > 1e-6:
-        raise ValueError(f"origin's yaw must be 0, not {yaw:g}; turn the picture instead")
+    origin = values.get("origin", [0, 0, 0])
+    if isinstance(origin, list) and len(origin) == 3 and str(origin[2]).strip("+-").lower() == "nan":
+        origin = [*origin[:2], 0]  # savers write the yaw of a flat map so
+    x, y, yaw = _numbers(origin, "origin's x, y (m) and yaw (rad)", PLACE, PLACE, TURN)
     free = number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
     occupied = number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
     if not 0.0 < free <= occupied:
@@ -128,25 +147,27 @@ def _checked(path: Path, values: Any) -> MapFile:
     return MapFile(
         image=_image_path(path, values["image"]),
         resolution=number(values["resolution"], "resolution (m a pixel)", *RESOLUTION),
-        origin=(x, y),
+        origin=(x, y, yaw),
         negate=bool(negate),
         free_thresh=free,
+        unknown=mode == "trinary",
         starts=[_numbers(start, "a start's x, y (m) and heading (rad)", PLACE, PLACE, TURN) for start in starts],
         speed=(low, high) if "speed" in values else None,
+        ignored=ignored,
     )
 
 
 def _image_path(path: Path, image: Any) -> Path:
-    """The path of a YAML's picture, which must be in the YAML's folder or below."""
+    """The path of a YAML's picture: in its folder or below, or the same file name there, of another machine's path."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
         raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {shown(image)}")
     try:
-        inside = (path.parent / image).resolve().is_relative_to(path.parent.resolve())
+        for picture in (path.parent / image, path.parent / PureWindowsPath(image).name):
+            if picture.exists() and picture.resolve().is_relative_to(path.parent.resolve()):
+                return picture
     except (OSError, ValueError, RuntimeError):  # a null character, a link to itself
         raise ValueError(f"image: {shown(image)} is not a valid path") from None
-    if not inside:
-        raise ValueError(f"image: {shown(image)} must lie in the YAML's own folder or below it")
-    return path.parent / image
+    raise ValueError(f"image: {shown(image)} is not in the YAML's own folder or below it; put the picture there")
 
 
 def read_free(file: MapFile) -> np.ndarray:
@@ -188,7 +209,10 @@ def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
             picture = picture.convert("RGB").convert("L", (1 / 3, 1 / 3, 1 / 3, 0))
         light, full = np.asarray(picture), 255
     values = np.arange(full + 1) / full
-    return ((values if file.negate else 1.0 - values) < file.free_thresh)[light] & opaque
+    free = (values if file.negate else 1.0 - values) < file.free_thresh
+    if file.unknown:
+        free[UNKNOWN * full // 255] = False
+    return free[light] & opaque
 
 
 def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
@@ -210,43 +234,65 @@ def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
     return columns, rows
 
 
-def _warn(stem: str, file: MapFile, free: np.ndarray, length: float, revisit: float) -> None:
-    """Warn of a road so short (m) that a second lap counts no distance, and of a picture that seems inverted."""
+def _border(road: np.ndarray) -> float:
+    """Share of road on the border of bool [rows, columns]."""
+    return float(np.concatenate([road[0], road[-1], road[:, 0], road[:, -1]]).mean())
+
+
+def _warnings(
+    file: MapFile, border: float, inverted: bool, closed: float, length: float, revisit: float
+) -> Iterator[str]:
+    """What a user should know of a map, each a sentence after its name.
+
+    Args: share of road on the picture's border, and whether what is wall may be the road; share of the road that is
+    closed as dead ends; the road's length, and that within which the same ground does not count again (m).
+    """
+    if file.ignored:
+        yield f"has keys in its YAML that mean nothing here: {', '.join(file.ignored)}"
+    if closed >= MOST_CLOSED:
+        yield (
+            f"loses {closed:.0%} of its road, which is closed by walls: dead ends in which the car cannot turn round, "
+            "and what is narrow. Give starts in its YAML to keep it as it is drawn"
+        )
     if length <= 1.05 * revisit:  # 5 % for the error of the estimate
-        text = (
-            f"{stem} has about {length:.0f} m of road. Ground driven again within {revisit:g} m does not count: "
+        yield (
+            f"has about {length:.0f} m of road. Ground driven again within {revisit:g} m does not count: "
             "cars end idle in their second lap. Make the road longer, or its resolution larger"
         )
-        warnings.warn(text, MapWarning, stacklevel=1)
-    border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
-    if border >= MOST_BORDER:
-        text = (
-            f"{border:.0%} of {stem}'s border is road. If the road is {'bright' if file.negate else 'dark'}, "
+    if inverted:
+        yield (
+            f"has road on {border:.0%} of its border. If the road is {'bright' if file.negate else 'dark'}, "
             f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
             "surroundings as wall"
         )
-        warnings.warn(text, MapWarning, stacklevel=1)
 
 
 @lru_cache(maxsize=4)
 def _load(name: str, _digest: str, config: SimConfig) -> Map:
     """Build a map. The digest is part of the cache's key, so that a changed file is read again."""
-    path, unit, vehicle = Path(name), config.unit, config.vehicle
+    path, unit = Path(name), config.unit
     file = read_map_file(path)
     free = read_free(file)
-    pixel = file.resolution / unit
-    vehicle = replace(vehicle, length=vehicle.length / unit, width=vehicle.width / unit)
+    pixel, border, closed = file.resolution / unit, _border(free), 0.0
+    sizes = {key: getattr(config.vehicle, key) / unit for key in ("length", "width", "wheelbase", "rear_axle")}
+    vehicle = replace(config.vehicle, **sizes)
+    picture = np.s_[1 : int(len(free) * pixel / NODE), 1 : int(free.shape[1] * pixel / NODE)]
     try:
-        columns, rows = _sides(free, pixel, unit)
-        nodes = signed_clearance(free, pixel, columns, rows)
+        nodes = signed_clearance(free, pixel, *_sides(free, pixel, unit))
+        inverted = border >= MOST_BORDER and bool(has_room(-nodes[picture], vehicle).any())
         if file.starts:
-            poses = (np.array(file.starts) - [*file.origin, 0.0]) / [unit, unit, 1.0]
+            poses = (np.array(file.starts) - file.origin) / [unit, unit, 1.0]
+            c, s = math.cos(file.origin[2]), math.sin(file.origin[2])
+            poses[:, :2] @= [[c, -s], [s, c]]
             check_starts(nodes, poses, vehicle, unit)
         else:
-            poses = find_starts(nodes, vehicle, unit)
+            nodes, poses, closed = find_starts(nodes, vehicle, unit, border >= MOST_BORDER)
     except ValueError as error:
         raise GridSimError(f"{path}: {error}") from None
-    _warn(path.stem, file, free, road_length(nodes) * unit, config.episode.revisit)
+    inverted |= _border(nodes[picture] > 0.0) >= MOST_BORDER
+    length = road_length(nodes) * unit
+    for text in _warnings(file, border, inverted, closed, length, config.episode.revisit):
+        warnings.warn(f"{path.stem} {text}", MapWarning, stacklevel=1)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3] = poses * [unit, unit, 1.0]
     return without_lanes(name, nodes, file.speed or config.file_speeds, 2.0 * HALF_WALL, starts, unit)

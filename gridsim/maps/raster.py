@@ -11,24 +11,29 @@ import numpy as np
 from scipy import ndimage
 
 from gridsim.config import VehicleConfig
-from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
+from gridsim.maps.closing import (
+    DEEPEST,
+    FAR,
+    MARGIN,
+    NODE,
+    drives_on,
+    needed,
+    without_dead_ends,
+    without_surroundings,
+)  # fmt: skip
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR
 
 OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
 _FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
 HALF_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
 _TIP = 0.25  # m that a corner may extend beyond a disc of radius HALF_WALL without being a thin wall
-_DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # m, the largest clearance that the field holds
-_HALO = _DEEPEST + 2.0  # m around a tile that can influence it
+_HALO = DEEPEST + 2.0  # m around a tile that can influence it
 _TILE = 128  # nodes
 
-_MARGIN = 0.3  # m free around a car at a start that we choose
 _TOUCH = 0.05  # m free around a car at a start given in the file
-_AHEAD = 6.0  # m free straight ahead of a car at a start
-_EXTENT = 30.0  # m, least extent of a road with starts
 _SMOOTH = 3.0  # m, standard deviation of the window over which a road's direction is averaged
 _COHERENCE = 0.5  # least agreement of directions there, from 0 (an open place, a crossing) to 1 (a straight road)
 _STARTS = 512
-_NODE = 1.0 / CELLS_PER_UNIT  # m
 _APART = 24  # nodes of wall around a window, so that averages on one side do not see the road on the other
 _BACK = np.array([0.0, 0.0, math.pi])
 
@@ -72,7 +77,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
             index, window, at = [], [], []
             for k, (start, side) in enumerate(((j, rows), (i, columns))):
                 node = first[k] + np.arange(start, min(start + _TILE, side))
-                pixel = node * (_NODE / resolution)  # from the picture's lower left corner
+                pixel = node * (NODE / resolution)  # from the picture's lower left corner
                 low = min(max(math.floor(pixel[0]), 0), padded.shape[k])
                 high = min(max(math.ceil(pixel[-1]) + 2 * halo, 0), padded.shape[k])
                 index.append(node % side)
@@ -81,11 +86,11 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
             part = padded[window[0], window[1]]
             if not part.any():
                 continue
-            distance = np.float32(_DEEPEST)
+            distance = np.float32(DEEPEST)
             if not part.all():
                 signed = _signed(part.repeat(cut, axis=0).repeat(cut, axis=1), resolution / cut)
                 distance = ndimage.map_coordinates(signed, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest")
-            nodes[np.ix_(*index)] = np.clip(distance, FIELD_FLOOR, _DEEPEST)
+            nodes[np.ix_(*index)] = np.clip(distance, FIELD_FLOOR, DEEPEST)
     return nodes
 
 
@@ -100,7 +105,7 @@ def _clearance_around(nodes: np.ndarray, poses: np.ndarray, along: np.ndarray, l
 def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: float) -> np.ndarray:
     """Whether a car with a margin (m) around it is entirely on the road at poses [n, 3]: bool [n]."""
     half = np.array([vehicle.length, vehicle.width]) / 2 + margin
-    along, left = (np.linspace(-h, h, math.ceil(2 * h / _NODE) + 1) for h in half)
+    along, left = (np.linspace(-h, h, math.ceil(2 * h / NODE) + 1) for h in half)
     u, v = (points.ravel() for points in np.meshgrid(along, left))
     return np.all(_clearance_around(nodes, poses, u, v) >= 0.0, axis=1)
 
@@ -121,31 +126,30 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across + math.pi / 2, np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, 1e-6)
 
 
-def _window(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of a field that has road, with wall around it, as a torus, and its corner: x, y (m).
+def _window(nodes: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """The index of the part of a field that has road, with wall around it, as a torus; and its corner: x, y (m).
 
     A track may be small in a large picture. A side is kept whole where cutting it would not make it shorter.
     """
-    corner = np.zeros(2)
-    for axis in (0, 1):
+    corner, index = np.zeros(2), [np.arange(side) for side in nodes.shape]
+    for axis, side in enumerate(nodes.shape):
         road = np.flatnonzero((nodes > 0.0).any(axis=1 - axis))
-        if len(road) and road[-1] - road[0] + 2 * _APART < nodes.shape[axis]:
-            index = np.arange(road[0] - _APART, road[-1] + _APART)
-            nodes = nodes.take(index, axis=axis, mode="wrap")
-            corner[1 - axis] = index[0] * _NODE
-    return nodes, corner
+        if len(road) and road[-1] - road[0] + 2 * _APART < side:
+            index[axis] = np.arange(road[0] - _APART, road[-1] + _APART) % side
+            corner[1 - axis] = (road[0] - _APART) * NODE
+    return np.ix_(*index), corner
 
 
 def road_length(nodes: np.ndarray) -> float:
     """Estimated length (m) of the largest connected road: area over width. Within 10 % for a ring."""
-    nodes, _ = _window(nodes)
+    nodes = nodes[_window(nodes)[0]]
     road = nodes > 0.0
     labels, _ = ndimage.label(road)
     middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
-    area = np.bincount(labels[road]) * _NODE**2
+    area = np.bincount(labels[road]) * NODE**2
     part, count = labels[middle], len(area)
     width = 2.0 * np.bincount(part, nodes[middle], count) / np.maximum(np.bincount(part, minlength=count), 1)
-    return float((area / np.maximum(width, _NODE)).max())
+    return float((area / np.maximum(width, NODE)).max())
 
 
 def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
@@ -153,42 +157,56 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
     return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
 
 
-def find_starts(nodes: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> np.ndarray:
-    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
+def has_room(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Where a field has room for a car to its sides, in parts with an extent of 30 m or more: bool [rows, columns]."""
+    parts, _ = ndimage.label(nodes >= needed(vehicle))
+    extent = [math.hypot(*(side.stop - side.start for side in box)) * NODE for box in ndimage.find_objects(parts)]
+    return (np.array([0.0, *extent]) >= FAR)[parts]
 
-    Raises: ValueError, in m of `unit` m, if there are none.
+
+def find_starts(
+    nodes: np.ndarray, vehicle: VehicleConfig, unit: float, surrounded: bool
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where to drive on a picture's road, of which parts are closed (see `closing`), and where to begin.
+
+    Args: the field, a car in units of `unit` m, and whether the road has surroundings that are drawn like road.
+    Returns: the field with walls where it is closed; start poses float64 [n, 3] (x, y, heading) along the road, both
+    ways, with a margin around a car that can drive on; the share of dead ends in the road.
+    Raises: ValueError if there are none.
     """
-    nodes, corner = _window(nodes)
-    labels, _ = ndimage.label(nodes >= vehicle.width / 2 + _MARGIN)
-    extent = [math.hypot(*(side.stop - side.start for side in box)) * _NODE for box in ndimage.find_objects(labels)]
-    large = (np.array([0.0, *extent]) >= _EXTENT)[labels]  # label 0 is none
-    if not large.any():
+    index, corner = _window(nodes)
+    within = nodes[index]
+    if not has_room(within, vehicle).any():
         raise ValueError(
-            f"no room for a car: the road is nowhere {unit * (vehicle.width + 2 * _MARGIN):.3g} m wide over "
-            f"{unit * _EXTENT:.3g} m; "
-            f"check the resolution and which pixels are bright"
+            f"no room for a car: the road is nowhere {unit * 2 * needed(vehicle):.3g} m wide over "
+            f"{unit * FAR:.3g} m; check the resolution and which pixels are bright"
         )
-    ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
-    angle, coherence = _directions(nodes)
+    if surrounded:
+        within = without_surroundings(within, vehicle)
+    part, ways = without_dead_ends(within, vehicle)
+    large = has_room(part, vehicle)
+    ridge = large & (part >= ndimage.maximum_filter(part, size=5, mode="wrap") - 0.25)
+    angle, coherence = _directions(part)
     row, column = np.nonzero(ridge)
-    along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])[coherence[row, column] >= _COHERENCE]
+    along = np.column_stack([column * NODE, row * NODE, angle[row, column]])[coherence[row, column] >= _COHERENCE]
     along = _spread_sample(along, 4 * _STARTS)
     poses = np.concatenate([along, along + _BACK])
-    steps = np.arange(1, round(_AHEAD / _NODE) + 1) * _NODE
-    goes_on = np.all(_clearance_around(nodes, poses, steps, 0.0) >= vehicle.width / 2, axis=1)
-    poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & goes_on]
+    poses = poses[_fits(part, poses, vehicle, MARGIN) & drives_on(ways, poses)]
     if not len(poses):
         raise ValueError(
-            f"no room for a car of {unit * vehicle.length:g} m x {unit * vehicle.width:g} m with {unit * _AHEAD:g} m "
-            f"of road ahead; check the resolution and which pixels are bright, or give starts in a YAML"
+            f"no room for a car of {unit * vehicle.length:g} m x {unit * vehicle.width:g} m that could drive on for "
+            f"{unit * FAR:g} m; check the resolution and which pixels are bright, or give starts in a YAML"
         )
     poses[:, :2] += corner
-    return _spread_sample(poses, _STARTS)
+    nodes = nodes.copy()
+    nodes[index] = part
+    dead = 1.0 - np.count_nonzero(part > 0.0) / np.count_nonzero(within > 0.0)
+    return nodes, _spread_sample(poses, _STARTS), dead
 
 
 def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> None:
     """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
-    inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * _NODE)).all(axis=1)
+    inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * NODE)).all(axis=1)
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):
         x, y = wrong[0, :2] * unit

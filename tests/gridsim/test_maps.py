@@ -27,6 +27,7 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv
 from gridsim.errors import GridSimError
+from gridsim.maps import closing
 from gridsim.maps.files import MAX_PIXELS, MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
 from gridsim.maps.map import starts_at
 from gridsim.maps.raster import signed_clearance
@@ -44,10 +45,11 @@ def track(tmp_path_factory):
 # --- Against closed forms --------------------------------------------------------------------------------------------
 
 
-def test_clearance_is_that_of_the_shape(track):
+def test_clearance_is_that_of_the_shape(tmp_path):
+    road = load_map(write_yaml(tmp_path, picture(), starts=[[47.5, 31.0, 0.5]])).road
     points = np.random.default_rng(0).random((20_000, 2)) * [W, H]
     exact = np.clip(distance(points[:, 0], points[:, 1]), -2.0, 255 / 32 - 2.0)
-    error = read(track.road, points) - exact
+    error = read(road, points) - exact
     # Within the union of two strips the clearance is more than that of either; without, it is exact.
     outside = exact <= 0.0
     assert np.quantile(np.abs(error[outside]), 0.99) < 0.1
@@ -88,7 +90,7 @@ def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
 
 def test_an_inverted_picture_is_told_by_environments_and_commands(tmp_path):
     save(tmp_path / "dark.png", 255 - ring(36.0, 5.0))
-    expected = "100% of dark's border is road. If the road is dark, set negate: 1 in its YAML"
+    expected = "dark has road on 100% of its border. If the road is dark, set negate: 1 in its YAML"
     with pytest.warns(MapWarning, match=expected):
         GridSimEnv(str(tmp_path / "dark.png"))
     done = finish("gridsim-evaluate", str(CHAMPION), "--scenario", "dark.png", "--episodes", "1", cwd=tmp_path)
@@ -131,7 +133,7 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
         v = -(x - 40 - offset) * math.sin(angle) + (y - 40 - offset) * math.cos(angle)
         return np.where(np.abs(v) <= 0.51 / PPM, -1.0, np.minimum(38 - np.abs(x - 40), 38 - np.abs(y - 40)))
 
-    scenario = load_map(save(tmp_path / "thin.png", picture(halved, 80.0, 80.0)))
+    scenario = load_map(write_yaml(tmp_path, picture(halved, 80.0, 80.0), starts=[[40.0, 60.0, 0.0]]))
     along, left = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
     on = 40 + offset + np.linspace(-25, 25, 2001)[:, None] * along
     assert read(scenario.road, on).max() < 0.0
@@ -177,13 +179,16 @@ def test_thresholds_negate_and_the_unknown(tmp_path):
         return levels[read_free(read_map_file(Path(write_yaml(tmp_path, **keys))))[0]].tolist()
 
     assert free() == [206, 254, 255]  # 205, map_server's unknown, is wall
-    assert free(free_thresh=0.25) == [205, 206, 254, 255]
+    assert free(free_thresh=0.25) == [206, 254, 255]
+    assert free(free_thresh=0.25, mode="scale") == [205, 206, 254, 255]
     assert free(negate=1) == [0]
     assert free(negate=True, free_thresh="2e-1") == [0, 50]
     assert levels[read_free(picture_alone)[0]].tolist() == [205, 206, 254, 255]
+    save(tmp_path / "map.pgm", np.tile(levels, (4, 1)))  # as robots save them
+    assert levels[read_free(read_map_file(tmp_path / "map.pgm"))[0]].tolist() == [206, 254, 255]
 
 
-FORMATS = "png:L pgm:L jpg:L bmp:L png:LA png:RGBA png:P png:1 png:I;16 pgm:I;16"
+FORMATS = "png:L pgm:L jpg:L bmp:L png:LA png:RGB png:RGBA png:P png:1 png:I;16 pgm:I;16"
 
 
 @pytest.mark.parametrize("form", FORMATS.split())
@@ -216,6 +221,166 @@ def test_tiles_do_not_show():
         moved = signed_clearance(np.pad(free[:, 400:700], [(0, 0), (shift * 2, 0)]), 0.25, 1024, 128)
         inner = slice(shift + 20, shift + 130)
         np.testing.assert_allclose(moved[:80, inner], nodes[:80, 200 + 20 : 200 + 130], atol=1e-5)
+
+
+# --- Maps as robots save them, and race tracks -----------------------------------------------------------------------
+
+
+def lines(*rings, width=0.5, side=110.0):
+    """A picture of circles (radius in m) as lines on white, 4 pixels a metre."""
+    away = lambda x, y: np.hypot(x - side / 2, y - side / 2)  # noqa: E731
+    return picture(lambda x, y: np.min([np.abs(away(x, y) - r) for r in rings], axis=0) - width / 2, side, side, 4)
+
+
+def ring_of(x0, y0, radius, half_width):
+    """The clearance of a ring."""
+    return lambda x, y: half_width - np.abs(np.hypot(x - x0, y - y0) - radius)
+
+
+def told(name, config=None):
+    """A map, and the warnings about it."""
+    with warnings.catch_warnings(record=True, action="always") as said:
+        scenario = load_map(name, config)
+    return scenario, [str(warning.message) for warning in said]
+
+
+def test_a_track_between_two_lines_is_not_what_surrounds_it_nor_its_middle(tmp_path):
+    scenario, said = told(write_yaml(tmp_path, lines(36.0, 46.0), resolution=0.25))
+    away = np.hypot(*(scenario.starts[:, :2] - 55.0).T)
+    assert len(away) == 512
+    assert (away.min(), away.max()) == pytest.approx((41.0, 41.0), abs=2.0)
+    assert not said
+    around = read(scenario.road, [[55.0, 55.0], [55.0, 30.0], [55.0, 3.0], [4.0, 4.0], [55.0, 14.0]])
+    assert (around > 0.0).tolist() == [False, False, False, False, True]
+
+
+def building(x, y):
+    """A hall, its outline 0.5 m thick with a gap of 8 m, and a corridor of 9 m that ends after 60 m."""
+    hall, corridor = strip(110, 50, 0.0, 35.0, 35.0)(x, y), strip(45, 50, 0.0, 4.5, 32.0)(x, y)
+    gap = (np.abs(x - 110) < 4) & (y > 80)
+    inside = np.maximum(hall, corridor)
+    return np.where(gap, 1.0, np.abs(inside + 0.25) - 0.25)
+
+
+@pytest.mark.parametrize(("sim", "unit"), [("default", 1.0), ("f1tenth", 0.125)])
+def test_gaps_of_an_outline_and_dead_ends_are_closed_and_told(tmp_path, sim, unit):
+    config, pixels = SimConfig.load(sim), picture(building, 170.0, 110.0, 4)
+    scenario, said = told(write_yaml(tmp_path, pixels, name="lab", resolution=0.25 * unit), config)
+    at = scenario.starts[:, :2] / unit
+    assert ((at > [75, 15]) & (at < [145, 85])).all()
+    places = unit * np.array([[5.0, 5.0], [110.0, 95.0], [30.0, 50.0], [90.0, 50.0]])
+    assert (read(scenario.road, places) > 0).tolist() == [0, 0, 0, 1]
+    assert len(said) == 1
+    assert re.match(r"lab loses \d+% of its road, .* Give starts in its YAML to keep it as it is drawn$", said[0])
+    start = [30.0 * unit, 50.0 * unit, 0.0]
+    kept = load_map(write_yaml(tmp_path, name="kept", resolution=0.25 * unit, starts=[start]), config)
+    assert read(kept.road, places[:3]).min() > 0
+
+
+def test_an_open_field_with_obstacles_is_road(tmp_path):
+    """It encloses nothing: what surrounds the obstacles is the road."""
+    scenario, said = told(save(tmp_path / "field.png", 255 - picture(ring_of(40, 40, 0.0, 4.0), 80.0, 80.0)))
+    assert len(scenario.starts)
+    assert "has road on 100% of its border" in said[-1]
+
+
+@pytest.mark.parametrize(("side", "open_"), [(12.0, False), (18.0, True)])
+def test_a_narrow_passage_is_closed_unless_it_leads_to_as_much_road_again(tmp_path, side, open_):
+    rooms = strip(25, 25, 0.0, 18.0, 18.0), strip(55, 25, 0.0, 1.6, 20.0), strip(80 - 18 + side, 25, 0.0, side, side)
+    road = load_map(
+        save(tmp_path / "a.png", picture(lambda x, y: np.max([r(x, y) for r in rooms], axis=0), 110, 50))
+    ).road
+    assert (read(road, [[25.0, 25.0], [53.0, 25.0], [75.0, 25.0]]) > 0).tolist() == [True, open_, open_]
+
+
+def test_what_is_not_joined_to_the_largest_road_is_closed(tmp_path):
+    apart = lambda x, y: np.maximum(ring_of(40, 50, 36, 4)(x, y), ring_of(100, 50, 16, 4)(x, y))  # noqa: E731
+    scenario, said = told(save(tmp_path / "two.png", picture(apart, 130.0, 100.0)))
+    assert (read(scenario.road, [[4.0, 50.0], [116.0, 50.0]]) > 0).tolist() == [True, False]
+    assert scenario.starts[:, 0].max() < 80
+    assert "closed by walls" in said[0]
+
+
+def test_a_long_car_does_not_jump_walls(tmp_path):
+    """Its bends are so wide that an arc from heading to heading is longer than a thin wall and the room beside it."""
+    halls = strip(42, 45, 0.0, 40.0, 40.0), strip(122, 45, 0.0, 40.0, 39.5)
+    pixels = picture(lambda x, y: np.max([hall(x, y) for hall in halls], axis=0), 165.0, 90.0, 4)
+    config = SimConfig.of({"vehicle": {"wheelbase": 5.0, "rear_axle": 2.5}})
+    road = load_map(write_yaml(tmp_path, pixels, resolution=0.25), config).road
+    assert (read(road, [[42.0, 45.0], [122.0, 45.0]]) > 0).tolist() == [True, False]
+
+
+def block(x, y):
+    """A road of 7 m around a square block whose corners are round."""
+    x, y = np.abs(x - 60.2) - 32, np.abs(y - 59.9) - 32
+    return 3.5 - np.abs(np.hypot(np.maximum(x, 0), np.maximum(y, 0)) + np.minimum(np.maximum(x, y), 0) - 10.0)
+
+
+@pytest.mark.parametrize("drawn", [ring_of(60, 60, 36, 2.4), block], ids=["ring", "block"])
+def test_a_road_without_dead_ends_stays_as_it_is_drawn(tmp_path, drawn):
+    road = load_map(save(tmp_path / "road.png", picture(drawn, 120.0, 120.0))).road
+    points = np.random.default_rng(0).random((50_000, 2)) * 120.0
+    clear = drawn(points[:, 0], points[:, 1])
+    assert read(road, points[clear > 0.15]).min() > 0.0
+    assert read(road, points[clear < -0.15]).max() < 0.0
+
+
+def test_the_middle_of_a_hall_stays_open(tmp_path):
+    """Its bends are circles along the walls, which do not come back to the middle."""
+    road = load_map(save(tmp_path / "hall.png", picture(strip(20, 20, 0.0, 15.0, 15.0), 40.0, 40.0))).road
+    assert read(road, [[20.0, 20.0], [18.0, 22.0]]).min() > 4.0
+
+
+def test_on_a_very_large_road_nothing_is_closed(tmp_path, monkeypatch):
+    monkeypatch.setattr(closing, "_MOST_CELLS", 100)
+    road = load_map(write_yaml(tmp_path, 255 - picture(building, 170.0, 110.0, 4), resolution=0.25, negate=1)).road
+    assert read(road, [[30.0, 50.0]])[0] > 0
+
+
+def test_where_no_road_goes_on_for_ever_starts_have_30_m_ahead(tmp_path):
+    scenario = load_map(save(tmp_path / "corridor.png", picture(strip(50, 20, 0.0, 4.0), 100.0, 40.0)))
+    ahead = np.where(np.cos(scenario.starts[:, 2]) > 0, 95.0 - scenario.starts[:, 0], scenario.starts[:, 0] - 5.0)
+    assert 27.0 < ahead.min() < 36.0  # of driving, not of a straight line
+
+
+def test_origin_may_be_turned_and_its_yaw_unknown(tmp_path):
+    pixels = picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0)
+    given = [[-40.0, 100.5, 0.1], [20.0, 101.0, 3.0]]
+    plain = load_map(write_yaml(tmp_path, pixels, origin=[-50.0, 81.0, 0.0], starts=given)).starts
+    unknown = load_map(write_yaml(tmp_path, origin=[-50.0, 81.0, "-nan"], starts=given)).starts
+    np.testing.assert_array_equal(unknown, plain)
+    c, s = math.cos(3.14), math.sin(3.14)
+    turned = [[7 + c * x - s * y, 5 + s * x + c * y, heading + 3.14] for x, y, heading, *_ in plain.tolist()]
+    found = load_map(write_yaml(tmp_path, origin=[7.0, 5.0, 3.14], starts=turned)).starts
+    np.testing.assert_allclose(found, plain, atol=1e-4)
+
+
+def test_keys_of_other_programs_are_told_once(tmp_path):
+    scenario, said = told(write_yaml(tmp_path, ring(36.0, 5.0), sx=1.0, map_ext=".png"))
+    assert said == ["map has keys in its YAML that mean nothing here: map_ext, sx"]
+    assert len(scenario.starts)
+
+
+@pytest.mark.parametrize("form", ["L", "RGB", "RGBA"])
+def test_unknown_is_never_road(tmp_path, form):
+    """As savers of ROS 2 write it: a free_thresh of 0.25, of which the grey 205 of what is unknown falls short."""
+    pixels = np.where(ring(36.0, 5.0) > 128, 254, 205).astype(np.uint8)
+    Image.fromarray(pixels).convert(form).save(tmp_path / "map.png")
+    free = read_free(read_map_file(Path(write_yaml(tmp_path, free_thresh=0.25, occupied_thresh=0.65))))
+    np.testing.assert_array_equal(free, pixels[::-1] == 254)
+
+
+@pytest.mark.parametrize("image", ["/home/robot/maps/map.png", "../maps/map.png", "C:\\maps\\map.png", "sub/map.png"])
+def test_a_picture_of_another_machine_lies_beside_its_yaml(tmp_path, image):
+    save(tmp_path / "map.png", ring(36.0, 5.0))
+    assert read_map_file(Path(write_yaml(tmp_path, image=image))).image == tmp_path / "map.png"
+
+
+def test_a_fine_resolution_for_a_small_car(tmp_path):
+    pixels = picture(lambda x, y: 0.6 - np.abs(np.hypot(x - 6, y - 6) - 4.6), 12.0, 12.0, 1 / 0.0079)
+    scenario = load_map(write_yaml(tmp_path, pixels, resolution=0.0079), SimConfig.load("f1tenth"))
+    away = np.hypot(*(scenario.starts[:, :2] - 6.0).T)
+    assert (away.min(), away.max()) == pytest.approx((4.6, 4.6), abs=0.15)
 
 
 # --- A scenario like others ------------------------------------------------------------------------------------------
@@ -329,18 +494,20 @@ WRONG = {
     "resolution: 0.1": "image",
     "image: map.png": "resolution",
     "{image: map.png, resolution: .nan}": "not nan",
-    "{image: map.png, resolution: 1e9}": "from 0.01 to 1",
+    "{image: map.png, resolution: 1e9}": "from 0.001 to 1",
     "{image: map.png, resolution: 1}": "is too large",
     "{resolution: 0.1, image: [map.png]}": "image must name",
-    "{resolution: 0.1, image: /map.png}": "own folder",
     "{resolution: 0.1, image: link.png}": "own folder",
     "{resolution: 0.1, image: loop.png}": "loop.png",
-    "{resolution: 0.1, image: none.png}": "No such file",
-    "{image: map.png, resolution: 0.1, start: []}": "unknown key 'start'",
+    "{resolution: 0.1, image: none.png}": "put the picture there",
+    "{resolution: 0.1, image: /home/robot/none.png}": "put the picture there",
+    "{image: map.png, resolution: 0.1, start: []}": "unknown key 'start'; did you mean starts?",
+    "{image: map.png, resolution: 0.1, occ_thresh: 0.65}": "did you mean occupied_thresh?",
     "{image: map.png, resolution: 0.1, free_thresh: 0.7}": "not above occupied_thresh",
     "{image: map.png, resolution: 0.1, negate: 2}": "negate",
     "{image: map.png, resolution: 0.1, mode: raw}": "mode must be trinary or scale",
-    "{image: map.png, resolution: 0.1, origin: [0, 0, 0.5]}": "yaw",
+    "{image: map.png, resolution: 0.1, origin: [0, 0, 90]}": "yaw",
+    "{image: map.png, resolution: 0.1, origin: [-nan, 0, 0]}": "origin's x",
     "{image: map.png, resolution: 0.1, speed: [9, 3]}": "speed",
     "{image: map.png, resolution: 0.1, starts: {x: 1}}": "starts",
     "{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}": "heading",

@@ -1,0 +1,136 @@
+"""What is closed by walls on a picture's road: the surroundings of a drawing, dead ends, and narrow places.
+
+All lengths are in units (`SimConfig.unit`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from gridsim.config import VehicleConfig
+from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
+
+NODE = 1.0 / CELLS_PER_UNIT
+DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # the largest clearance that the field holds
+MARGIN = 0.3  # free around a car, where we choose its place
+FAR = 30.0  # least extent of a road, and how far a car can drive on from a start where all road is a dead end
+
+_CORNERS_TOO = np.ones((3, 3))  # of a node's neighbours
+_LEAST_DRAWING = 0.05  # share of the road that a drawing encloses, at least
+
+_SIDE = 2  # nodes, of the cells at which dead ends are looked for
+_MOST_CELLS = 1 << 19  # of road; where there are more, there is too little memory to look for dead ends
+_TURNS = 16  # headings of a car at a cell
+_TURN = 2 * math.pi / _TURNS
+_STRIDE = 1.5  # between two places of an arc that must be free, at most: no wall fits between them
+_SLACK = 0.5  # of road that stays beside where a car fits, as cells are coarse: edges of a road stay as they are drawn
+# Free on both sides of a car, and the radius of its bends as a multiple of its tightest.
+_EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
+
+
+def needed(vehicle: VehicleConfig) -> float:
+    """The clearance that a car needs."""
+    return vehicle.width / 2 + MARGIN
+
+
+def _distance(region: np.ndarray) -> np.ndarray:
+    """Distance of each node from a region, bool [rows, columns]."""
+    return ndimage.distance_transform_edt(~region) * NODE if region.any() else np.full(region.shape, math.inf)
+
+
+def without_surroundings(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """The field of a picture with road along its border, where what surrounds the drawing is closed.
+
+    The surroundings are what a disc reaches from outside, so large a one that it does not slip through gaps of an
+    outline. If a drawing encloses anything, what has no wall in common with its surroundings is closed, too: the middle
+    of a race track between two lines.
+    """
+    room = needed(vehicle)
+    reach = math.ceil(DEEPEST / NODE) + 1
+    (box,) = ndimage.find_objects((nodes > 0.0).astype(int))
+    drawn = np.zeros(np.add(nodes.shape, 2 * reach), dtype=bool)
+    drawn[reach:-reach, reach:-reach][box] = nodes[box] <= 0.0
+    parts, _ = ndimage.label(_distance(drawn) >= DEEPEST)
+    outside = (parts == parts[0, 0])[reach:-reach, reach:-reach]
+    inside = np.minimum(nodes, _distance(outside) - DEEPEST)
+    if np.count_nonzero(inside >= room) < _LEAST_DRAWING * np.count_nonzero(nodes >= room):
+        return nodes
+    walls, _ = ndimage.label(inside < room, _CORNERS_TOO)
+    beside = ndimage.binary_dilation(walls == walls[0, 0], _CORNERS_TOO)
+    parts, _ = ndimage.label(inside >= room)
+    return np.minimum(inside, _distance((parts > 0) & ~np.isin(parts, parts[beside])) - room)
+
+
+def _bends(cells: np.ndarray, radius: float) -> csr_matrix:
+    """How a car can move: a graph with vertex h * n + k for heading h at free cell k of n, and an edge for each arc.
+
+    Arcs lead to the next heading on the right, straight on, or to the left.
+    Args: free cells, bool [cells y, cells x], and the radius of arcs.
+    """
+    arc, side = radius * _TURN, _SIDE * NODE
+    shares = np.linspace(0.0, 1.0, math.ceil(arc / _STRIDE) + 1)[1:]
+    reach = math.ceil(arc / side)
+    row, column = np.nonzero(np.pad(cells, reach))
+    number = np.full(np.add(cells.shape, 2 * reach), -1, dtype=np.int32)
+    number[row, column] = np.arange(len(row))
+    tails, heads = [], []
+    for heading in range(_TURNS):
+        for turn in (-1, 0, 1):
+            angle = _TURN * (heading + turn * shares / 2)
+            away = np.rint(arc * shares / side * [np.sin(angle), np.cos(angle)]).astype(int)
+            passed = number[row[:, None] + away[0], column[:, None] + away[1]]
+            clear = np.flatnonzero((passed >= 0).all(axis=1)).astype(np.int32)
+            tails.append(np.int32(heading * len(row)) + clear)
+            heads.append(np.int32((heading + turn) % _TURNS * len(row)) + passed[clear, -1])
+    tail, head = np.concatenate(tails), np.concatenate(heads)
+    size = _TURNS * len(row)
+    return csr_matrix((np.ones(len(tail), dtype=bool), (tail, head)), (size, size))
+
+
+def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Close what is narrow, dead ends, and what is not joined to the rest.
+
+    What stays is where a car fits in the largest strongly connected part of its bends: from anywhere there it can drive
+    on and come back, forwards. It has easy bends with much room, or hard ones if these leave more than twice as much.
+    Where all road is a dead end, nothing is closed.
+    Returns: the field; from where a car can drive on, there or else for FAR: bool [headings, cells y, cells x].
+    """
+    clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]  # a cell's is that of its freest node
+    if np.count_nonzero(clearance >= needed(vehicle)) > _MOST_CELLS:
+        return nodes, np.ones((_TURNS, *clearance.shape), dtype=bool)
+    tightest = math.hypot(vehicle.wheelbase / math.tan(math.radians(vehicle.steering_limit)), vehicle.rear_axle)
+    found = []
+    for margin, ease in (_EASY, _HARD):
+        room = vehicle.width / 2 + margin
+        cells, ways = clearance >= room, np.zeros((_TURNS, *clearance.shape), dtype=bool)
+        bends = _bends(cells, ease * tightest)
+        _, part = connected_components(bends, connection="strong")
+        largest = (part == np.bincount(part, minlength=1).argmax()).reshape(_TURNS, -1)
+        ways[:, cells] = largest | np.roll(largest, _TURNS // 2, axis=0)  # also driven the other way
+        core = ways.any(axis=0)
+        holes, _ = ndimage.label(~core)
+        core |= ~np.isin(holes, holes[~cells])  # the middle of a hall, which bends do not come back to
+        found.append((np.count_nonzero(core), room, core, ways))
+    _, room, core, ways = found[0] if found[0][0] >= found[1][0] / 2 else found[1]
+    (box,) = ndimage.find_objects(core.astype(int)) or [(slice(0, 0), slice(0, 0))]
+    if math.hypot(*(side.stop - side.start for side in box)) * _SIDE * NODE < FAR:
+        on = np.ones(bends.shape[0], dtype=bool)
+        for _ in range(math.ceil(FAR / (ease * tightest * _TURN - NODE))):
+            on = bends @ on
+        ways[:, cells] = on.reshape(_TURNS, -1)
+        return nodes, ways
+    core = core.repeat(_SIDE, axis=0).repeat(_SIDE, axis=1)[: nodes.shape[0], : nodes.shape[1]]
+    beyond = room + _SLACK - _distance(core)
+    return np.minimum(nodes, np.maximum(beyond, _distance(beyond <= 0.0) - NODE)), ways
+
+
+def drives_on(ways: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Whether a car can drive on from each of poses [n, 3]: bool [n]; see `without_dead_ends`."""
+    heading = np.rint(poses[:, 2] / _TURN).astype(int) % _TURNS
+    column, row = np.floor((poses[:, :2].T + NODE / 2) / (_SIDE * NODE)).astype(int)
+    return ways[heading, row, column]
