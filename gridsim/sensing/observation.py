@@ -13,14 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import ONE, F, U, exact, freeze
-from gridsim.state import SPEED, STEERING
+from gridsim.jit import ONE, ZERO, F, U, exact, freeze
+from gridsim.sensing import route
+from gridsim.sensing.route import AHEAD
+from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
 SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; a perceptron of a small car less (`SimConfig.pace`)
 
 
 class Feature(NamedTuple):
-    """A part of an observation: values in SI units, which in a mirror are in reverse order."""
+    """A part of an observation: values in SI units, or shares."""
 
     name: str
     values: int
@@ -29,7 +31,8 @@ class Feature(NamedTuple):
     near: bool = False  # networks resolve small values best: they read v as 2 v / (v + unit) - 1
     least: np.float32 = -ONE  # what the environment returns, at least
     shift: float = 0.0  # added to what networks read
-    mirror: float = 1.0  # factor of the values in a mirror
+    mirror: tuple[float, ...] = (1.0,)  # factors of the values in a mirror, over and over
+    reversed: bool = True  # whether their order is reversed in a mirror
     sees: str = ""  # what a network sees that names it, as in `mlp:64+steering`; "": all networks see it
 
 
@@ -40,13 +43,15 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("ranges", int(k.rays), k.ray_range, F(8.0) * k.unit, near=True, least=F(0.0)),
         Feature("motion", int(k.rays), *speed, sees="how fast the cars that rays hit approach"),
         Feature("speed", 1, *speed, least=slowest, shift=-1.0),
-        Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
+        Feature("steering", 1, k.steering_limit, F(0.5), mirror=(-1.0,), sees="its own steering angle"),
+        Feature("route", 2 * len(AHEAD), ONE, ONE, mirror=(1.0, -1.0), reversed=False, sees="a route to follow"),
     )
 
 
 USUAL = constants(SimConfig())
 FEATURES = features(USUAL)
 OPTIONAL = tuple(feature.name for feature in FEATURES if feature.sees)
+ROUTE = [feature.name for feature in FEATURES].index("route")
 
 
 class Encoding(NamedTuple):
@@ -76,6 +81,22 @@ def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
     return Encoding(freeze(np.cumsum([0, *values])), freeze(near > 0.0), *map(freeze, others))
 
 
+def mirrored(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """An observation in a mirror: the index of each value's image, int64 [values], and its factor, float64 [values]."""
+    order, factors, first = list[np.ndarray](), list[np.ndarray](), encoding(names).first
+    for feature, *ends in zip(FEATURES, first, first[1:], strict=False):
+        values = np.arange(*ends)
+        order.append(values[::-1] if feature.reversed else values)
+        factors.append(np.resize(feature.mirror, len(values)))
+    return np.concatenate(order), np.concatenate(factors)
+
+
+@exact
+def sees(encoding, feature):
+    """Whether a feature, by its number, is seen."""
+    return encoding.first[feature] < encoding.first[feature + 1]
+
+
 @exact
 def _put(encoding, feature, values, observation):
     """Write the values of a feature, by its number, if it is seen."""
@@ -92,6 +113,10 @@ def observe(simulation, car, world, ranges, closing, observation):
     _put(encoding, 1, closing, observation)
     _put(encoding, 2, (car[SPEED],), observation)
     _put(encoding, 3, (car[STEERING],), observation)
+    if sees(encoding, ROUTE) and car[ROUTE_KEY] > ZERO:
+        points = observation[encoding.first[ROUTE] :]
+        route.read(simulation, car, points)
+        _put(encoding, ROUTE, points, observation)
 
 
 @exact
