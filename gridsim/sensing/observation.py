@@ -31,7 +31,7 @@ class Feature(NamedTuple):
     near: bool = False  # networks resolve small values best: they read v as 2 v / (v + unit) - 1
     least: np.float32 = -ONE  # what the environment returns, at least
     shift: float = 0.0  # added to what networks read
-    mirror: tuple[float, ...] = (1.0,)  # factors of the values in a mirror, over and over
+    mirror: float = 1.0  # factor of the values in a mirror
     reversed: bool = True  # whether their order is reversed in a mirror
     sees: str = ""  # what a network sees that names it, as in `mlp:64+steering`; "": all networks see it
 
@@ -43,14 +43,15 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("ranges", int(k.rays), k.ray_range, F(8.0) * k.unit, near=True, least=F(0.0)),
         Feature("motion", int(k.rays), *speed, sees="how fast the cars that rays hit approach"),
         Feature("speed", 1, *speed, least=slowest, shift=-1.0),
-        Feature("steering", 1, k.steering_limit, F(0.5), mirror=(-1.0,), sees="its own steering angle"),
-        Feature("route", 2 * len(AHEAD), ONE, ONE, mirror=(1.0, -1.0), reversed=False, sees="a route to follow"),
+        Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
+        Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
+        Feature("route", len(AHEAD), ONE, F(0.5), mirror=-1.0, reversed=False, sees="a route to follow"),
     )
 
 
 USUAL = constants(SimConfig())
 FEATURES = features(USUAL)
-OPTIONAL = tuple(feature.name for feature in FEATURES if feature.sees)
+OPTIONAL = tuple(dict.fromkeys(feature.name for feature in FEATURES if feature.sees))
 ROUTE = [feature.name for feature in FEATURES].index("route")
 
 
@@ -82,13 +83,13 @@ def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
 
 
 def mirrored(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """An observation in a mirror: the index of each value's image, int64 [values], and its factor, float64 [values]."""
-    order, factors, first = list[np.ndarray](), list[np.ndarray](), encoding(names).first
-    for feature, *ends in zip(FEATURES, first, first[1:], strict=False):
-        values = np.arange(*ends)
-        order.append(values[::-1] if feature.reversed else values)
-        factors.append(np.resize(feature.mirror, len(values)))
-    return np.concatenate(order), np.concatenate(factors)
+    """An observation in a mirror: the index of each value's image, int64 [values], and its factor, float32 [values]."""
+    first = encoding(names).first
+    order = [
+        np.arange(*ends)[:: -1 if feature.reversed else 1]
+        for feature, *ends in zip(FEATURES, first, first[1:], strict=False)
+    ]
+    return np.concatenate(order), encoding(names).each(feature.mirror for feature in FEATURES)
 
 
 @exact
@@ -114,9 +115,10 @@ def observe(simulation, car, world, ranges, closing, observation):
     _put(encoding, 2, (car[SPEED],), observation)
     _put(encoding, 3, (car[STEERING],), observation)
     if sees(encoding, ROUTE) and car[ROUTE_KEY] > ZERO:
-        points = observation[encoding.first[ROUTE] :]
-        route.read(simulation, car, points)
-        _put(encoding, ROUTE, points, observation)
+        values = observation[encoding.first[ROUTE] :]
+        route.read(simulation, car, values)
+        _put(encoding, ROUTE, values, observation)
+        _put(encoding, ROUTE + 1, values[len(AHEAD) :], observation)
 
 
 @exact

@@ -131,10 +131,9 @@ def follow_route(network, car, most):
 
 @exact
 def read(simulation, car, values):
-    """Write the points of AHEAD in the car's frame to values float32 [8 or more].
+    """Write where the points of AHEAD are to values float32 [8]: how far ahead of the car, then how far to the left.
 
-    A point is two values, how far ahead and how far to the left of the car it is, as shares of its distance along the
-    route.
+    Both are shares of the points' distances along the route.
     """
     network, place, metres = simulation.network, _place(car), ZERO
     for k in range(len(AHEAD)):
@@ -142,8 +141,8 @@ def read(simulation, car, values):
         place, metres = _walk(network, place, further - metres), further
         x, y = _point(network, place)
         dx, dy = wrapped_any(x - car[X], network.width), wrapped_any(y - car[Y], network.height)
-        values[2 * k] = (dx * car[COS] + dy * car[SIN]) / metres
-        values[2 * k + 1] = (dy * car[COS] - dx * car[SIN]) / metres
+        values[k] = (dx * car[COS] + dy * car[SIN]) / metres
+        values[len(AHEAD) + k] = (dy * car[COS] - dx * car[SIN]) / metres
 
 
 @njit(nogil=True)

@@ -209,9 +209,9 @@ def in_a_mirror(spec, observations):
     if "motion" in spec.features:
         seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
     first = spec.inputs
-    if "route" in spec.features:  # points, ahead and to the left
+    if "route" in spec.features:  # points, how far ahead and then how far to the left
         first -= 8
-        seen[:, first + 1 :: 2] = -observations[:, first + 1 :: 2]
+        seen[:, -4:] = -observations[:, -4:]
     if "steering" in spec.features:
         seen[:, first - 1] = -observations[:, first - 1]
     return seen
