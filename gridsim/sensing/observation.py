@@ -45,7 +45,7 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("speed", 1, *speed, least=slowest, shift=-1.0),
         Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
         Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
-        Feature("route", len(AHEAD), ONE, F(0.5), mirror=-1.0, reversed=False, sees="a route to follow"),
+        Feature("route", len(AHEAD), ONE, ONE, mirror=-1.0, reversed=False, sees="a route to follow"),
     )
 
 

@@ -11,6 +11,7 @@ from pictures import picture, write_yaml
 from written_roads import osm, street
 
 import gridsim  # noqa: F401, registers the environments
+from cluster.settings import EvolveSettings
 from evolution.episodes.rollout import evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.export import layers_of
@@ -244,8 +245,8 @@ def test_what_is_rewound_goes_on_along_the_same_route():
 
 def test_a_picture_has_no_route(tmp_path):
     name = write_yaml(tmp_path, picture(lambda x, y: 5.0 - np.abs(y - 8.0), 256.0, 16.0))
-    with pytest.raises(ValueError, match="no lanes"):
-        GridSimEnv(name, route=True)
+    with pytest.raises(GridSimError, match="no lanes to follow; leave out"):
+        EvolveSettings(scenario=name, policy="mlp:3+route").check()
     road_map, spec = build(name, 0), PolicySpec.parse("mlp:3+route")
     with pytest.raises(GridSimError, match="no lanes to follow"):
         Simulator(1, features=SEES).reset(road_map, sample_starts(road_map, 1, np.random.default_rng(0)))
