@@ -20,6 +20,7 @@ from gridsim.state import COS, POSE, ROUTE_ALONG, ROUTE_KEY, ROUTE_LANE, SIN, X,
 
 AHEAD = (F(5.0), F(10.0), F(20.0), F(40.0))  # units along the route to the points that are seen
 ASTRAY = F(6.0)  # units from the route beyond which an episode ends
+_OPPOSITE = F(1e8)  # m2, more than any squared distance on a map
 _KEYS = U((1 << 24) - 1)  # float32 has whole numbers up to here
 
 
@@ -84,21 +85,26 @@ def _beside(network, car, k):
 def begin_route(network, start, car):
     """Begin the route of a car that has been put at `start`, or go on along the one that the start names.
 
-    A new one begins on the lane that leads the car's way and is nearest.
+    A new one begins where the nearest lane is that leads the car's way.
     """
     goes_on = start.shape[0] > POSE and start[POSE + 1] > ZERO
     best = F(np.inf)
     for lane in range(network.steps.shape[0]):
-        if goes_on and F(lane) != start[POSE]:
+        box = network.boxes[lane]
+        beside_x = max(abs(wrapped_any(car[X] - box[0], network.width)) - box[2], ZERO)
+        beside_y = max(abs(wrapped_any(car[Y] - box[1], network.height)) - box[3], ZERO)
+        if (goes_on and F(lane) != start[POSE]) or beside_x * beside_x + beside_y * beside_y > best:
             continue
         first = network.offsets[lane]
         for k in range(first, network.offsets[lane + 1] - 1):
             share, away, leads = _beside(network, car, U(k))
-            if away < best and (goes_on or leads > ZERO):
+            if leads <= ZERO:
+                away += _OPPOSITE
+            if away < best:
                 best, part = away, min(max(share, ZERO), ONE)
                 car[ROUTE_LANE], car[ROUTE_ALONG] = F(lane), (F(k - first) + part) * network.steps[lane]
     if network.steps.shape[0] > 0:
-        drawn = mix(mix(U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))))
+        drawn = mix(U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0))))
         car[ROUTE_KEY] = start[POSE + 1] if goes_on else F(drawn & _KEYS | U(1))
 
 
