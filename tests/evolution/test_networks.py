@@ -301,7 +301,7 @@ def rays(spec):
 
 
 @CONFIGS
-@pytest.mark.parametrize("text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering"])
+@pytest.mark.parametrize("text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering+route"])
 def test_perceptrons_give_the_kernels_outputs(text, config):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, MlpSpec)
@@ -331,7 +331,7 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
 
 @CONFIGS
 @pytest.mark.parametrize("more", ["", "+continuous"])
-@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering", "cnn:8,8,24@2"])
+@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering+route", "cnn:8,8,24@2"])
 def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, more, config, tmp_path):
     text += more
     genome = np.random.default_rng(7).normal(0.0, 0.2, PolicySpec.parse(text).size).astype(F)
