@@ -142,6 +142,8 @@ class RunSettings(ABC):
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
         spec = PolicySpec.parse(self.policy)
+        if "route" in spec.features and not has_lanes(self.scenario):
+            raise GridSimError(f"--policy {self.policy}: {self.scenario} has no lanes to follow; leave out +route")
         if spec.observation != self.observation:
             remedy = f"give --observation {spec.observation}, or a policy such as {self.defaults()['policy']}"
             raise GridSimError(f"policy {self.policy} sees the {spec.observation}; {remedy}")
@@ -171,9 +173,9 @@ class EvolveSettings(RunSettings):
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
-    +steering to see its own steering angle; by default mlp:64+steering, in traffic
-    mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
-    of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    +steering to see its own steering angle, +route to see where a route leads that it has to follow; by default
+    mlp:64+steering, in traffic mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of
+    two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
@@ -265,8 +267,8 @@ class DqnSettings(RunSettings):
     verb: ClassVar[str] = "training"
 
     policy: Annotated[str, IN_WORDS] = ""
-    """Network of the Q function: mlp: and the sizes of its hidden layers, +steering to see its own steering
-    angle, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
+    """Network of the Q function: mlp: and the sizes of its hidden layers, and what else it sees as for gridsim-evolve,
+    by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
     layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
     """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""

@@ -17,6 +17,7 @@ import numpy as np
 from gridsim.car.models import MODELS, Numbers
 from gridsim.errors import GridSimError
 from gridsim.reading import limits_of, number, quantity, read_yaml, shown
+from gridsim.state import POSE
 
 _F = np.float32
 
@@ -158,11 +159,11 @@ class SimConfig:
     randomise: tuple[tuple[str, float, float], ...] = ()
 
     def drawn(self, start: np.ndarray) -> SimConfig:
-        """The configuration of the episode with a start float32 [5]: the same start gives the same vehicle."""
+        """The configuration of the episode with a start float32 [5 or more]: the same start gives the same vehicle."""
         if not self.randomise:
             return self
         rng = np.random.default_rng(
-            np.random.SeedSequence(np.asarray(start, dtype=np.float32).view(np.uint32).tolist())
+            np.random.SeedSequence(np.asarray(start[:POSE], dtype=np.float32).view(np.uint32).tolist())
         )
         values: dict[str, Any] = {name: float(rng.uniform(least, most)) for name, least, most in self.randomise}
         return replace(self, vehicle=replace(self.vehicle, **values), randomise=())

@@ -15,7 +15,8 @@ from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
 from gridsim.sensing.imperfections import History, imperfections_of, late_command
 from gridsim.sensing.observation import encoding
-from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.sensing.route import check_lanes
+from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 
 MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
@@ -134,7 +135,7 @@ class Simulator:
         self.closing = np.zeros((cars, self.config.sensors.rays * ("motion" in features)), dtype=np.float32)
         self.observations = np.zeros((cars, values), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
-        self._starts = np.zeros((cars, 5), dtype=np.float32)
+        self._starts = np.zeros((cars, POSE), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
         delays, rays = imperfections_of(self.config)[1], self.config.sensors.rays
         self._histories = delays and (
@@ -164,14 +165,15 @@ class Simulator:
 
         Args:
             maps: the map of each car [k], or one for all.
-            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
+            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad); or [k, 7], to go on along a
+                route (`state.START_FIELDS`).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
         starts, traffic = starts.astype(np.float32), (len(cars), *self.worlds.shape[1:])
-        if len(maps) != len(cars) or starts.shape != (len(cars), 5):
+        if len(maps) != len(cars) or starts.shape not in [(len(cars), fields) for fields in (POSE, START_FIELDS)]:
             raise ValueError(f"there are {len(cars)} cars, not {len(maps)} maps and starts of shape {starts.shape}")
         if worlds is not None and worlds.shape != traffic:
             raise ValueError(f"traffic must be {traffic[0]} worlds of {traffic[1]} cars, not {worlds.shape}")
@@ -182,7 +184,7 @@ class Simulator:
         if cells > self.visits.shape[1]:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
-        self._starts[cars] = starts
+        self._starts[cars] = starts[:, :POSE]
         self._drawn = {i: drawn for i, drawn in self._drawn.items() if i not in cars}
         for batch in self._batches(cars):
             _place_all(*batch, cars, starts, *self._arrays())
@@ -214,6 +216,8 @@ class Simulator:
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
+        for each in set(maps):
+            check_lanes(each, self.features)
         self.maps.update(zip(cars.tolist(), maps, strict=True))
         before = self._rows.copy()
         if not set(maps) <= self._row_of.keys():

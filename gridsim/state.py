@@ -22,7 +22,9 @@ STEPS = 11  # control steps
 CELL = 12  # index of the visit cell the car is in
 FRESH = 13  # 1 if this cell's ground is new
 YAW_RATE, SLIP = 14, 15  # rad/s, and rad between heading and course, of a dynamic vehicle model; else 0
-CAR_FIELDS = 16
+ROUTE_LANE, ROUTE_ALONG = 16, 17  # where on its route it is: a lane, and m along it
+ROUTE_KEY = 18  # decides which lanes come after that one, a whole number; 0 without a route
+CAR_FIELDS = 19
 
 # Further columns of a car of the traffic.
 LANE = 5  # index of its lane; -1 for an absent car, which is ignored
@@ -42,13 +44,17 @@ LANE_TIMER = 19  # control steps until its next decision on a change of lanes
 SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
 TRAFFIC_FIELDS = 21
 
+# A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). One from which a car goes on
+# along a route also has the lane and the key of that.
+POSE, START_FIELDS = 5, 7
+
 
 class End(IntEnum):
     """How an episode ended.
 
-    A collision and idling terminate: the value of what follows is 0. Success and time truncate: the road goes on, and
-    the observation shows neither the distance nor the time driven, so that the value of what follows is estimated from
-    the last observation (Pardo et al. 2018, "Time limits in reinforcement learning", section 4).
+    A collision, idling and going astray terminate: the value of what follows is 0. Success and time truncate: the road
+    goes on, and the observation shows neither the distance nor the time driven, so that the value of what follows is
+    estimated from the last observation (Pardo et al. 2018, "Time limits in reinforcement learning", section 4).
     """
 
     RUNNING = 0
@@ -56,9 +62,10 @@ class End(IntEnum):
     IDLE = 2  # too many steps without progress
     SUCCESS = 3  # the target distance is reached
     TIME = 4  # the time limit
+    ASTRAY = 5  # too far from the route
 
 
-TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])  # bool [ends]
+TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE, End.ASTRAY])  # bool [ends]
 TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 

@@ -21,9 +21,28 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
 from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_readings
-from gridsim.sensing.observation import Encoding, encoding, observe
+from gridsim.sensing.observation import ROUTE, Encoding, encoding, observe, sees
 from gridsim.sensing.rays import cast_boxes, fan, sense
-from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
+from gridsim.sensing.route import ASTRAY, begin_route, check_lanes, follow_route
+from gridsim.state import (
+    CELL,
+    COS,
+    DEBT,
+    DISTANCE,
+    FRESH,
+    IDLE,
+    ODOMETER,
+    PACED,
+    POSE,
+    ROUTE_KEY,
+    ROUTE_LANE,
+    SIN,
+    SPEED,
+    STEERING,
+    STEPS,
+    X,
+    Y,
+)  # fmt: skip
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
 
 _VISIT_SCALE = F(1.0 / VISIT_CELL)
@@ -51,7 +70,9 @@ def parameters(config: SimConfig, features: tuple[str, ...] = ()) -> tuple[Any, 
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig, features: tuple[str, ...] = ()) -> list[Simulation]:
-    """A Simulation for each map, as `parameters`."""
+    """A Simulation for each map, as `parameters`. Raises: GridSimError for a route without lanes."""
+    for each in road_maps:
+        check_lanes(each, features)
     shared = parameters(config, features)
     return [Simulation(each.road, each.network, *shared) for each in road_maps]
 
@@ -79,7 +100,7 @@ def visit_cell(road, x, y, cosine, sine):
 
 @leaf
 def place(simulation, start, car, visits):
-    """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
+    """Put a car at the start of an episode: start float32 [5], or [7] to go on along a route (`state.START_FIELDS`)."""
     road = simulation.road
     car[:] = ZERO
     car[X] = start[0] - math.floor(start[0] / road.width) * road.width
@@ -90,14 +111,17 @@ def place(simulation, start, car, visits):
     cell = visit_cell(road, car[X], car[Y], car[COS], car[SIN])
     car[CELL], car[FRESH] = F(cell), ONE
     visits[cell] = ZERO
+    if sees(simulation.encoding, ROUTE):
+        begin_route(simulation.network, start, car)
 
 
 @leaf
 def start_from(car, start):
-    """The inverse of `place`: write a car's pose to start float32 [5]."""
+    """The inverse of `place`: write a car's pose and route to start float32 [7]."""
     start[0], start[1] = car[X], car[Y]
     start[2] = math.atan2(car[SIN], car[COS])
     start[3], start[4] = car[SPEED], car[STEERING]
+    start[POSE], start[POSE + 1] = car[ROUTE_LANE], car[ROUTE_KEY]
 
 
 @leaf
@@ -176,6 +200,11 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         if gap > REENTRY * road.unit:
             car[FRESH] = ONE if gap > constants.revisit else ZERO
     visits[cell] = odometer
+    astray = False
+    if car[ROUTE_KEY] > ZERO:  # progress along the route is new ground
+        moved, away = follow_route(simulation.network, car, F(2.0) * abs(moved))
+        astray = away > (ASTRAY * road.unit) ** 2
+        car[FRESH] = ONE
     gained = ZERO
     if moved < ZERO:
         car[DEBT] -= moved
@@ -197,6 +226,8 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         car[IDLE] = ZERO
     if crashed:
         return 1
+    if astray:
+        return 5
     if car[IDLE] >= F(constants.patience):
         return 2
     if car[DISTANCE] >= target:

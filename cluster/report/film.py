@@ -7,6 +7,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from subprocess import PIPE, Popen
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
+from gridsim.sensing.route import points_ahead
 from gridsim.simulator import views
 from gridsim.state import DISTANCE, LANE, SPEED, End, X, Y
 
@@ -50,6 +52,11 @@ class Recording:
     def period(self) -> float:
         """Seconds from state to state."""
         return self.sim.episode.control_period
+
+    @cached_property
+    def route(self) -> np.ndarray:
+        """Points of its route ahead of each state, m: float32 [steps + 1, points, 2]."""
+        return points_ahead(self.scenario, self.cars)
 
     @property
     def seconds(self) -> float:
@@ -99,7 +106,8 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
     text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {minutes:.0f}:{rest:04.1f}"
     if drive.end != End.RUNNING and seconds >= drive.seconds - 1e-9:
         text += f"    {drive.end.name.lower()}"
-    return renderer.draw(car, boxes=boxes, ranges=ranges, path=path, text=(text, title))
+    route = drive.route[k] + part * drive.scenario.shortest(drive.route[following] - drive.route[k])
+    return renderer.draw(car, boxes=boxes, ranges=ranges, path=path, text=(text, title), route=route)
 
 
 def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") -> Iterator[np.ndarray]:

@@ -74,6 +74,7 @@ class Shown:
                     outputs, low, high = ACTIONS, shares.min(axis=1, keepdims=True), shares.max(axis=1, keepdims=True)
                     shares = (shares - low) / np.maximum(high - low, 1e-9)
                 channels += list((shares * (TURN - 1)).T)
+            channels += list((drive.route / size * TURN).reshape(len(cars), -1).T)
         numbers = np.rint(channels).astype(np.int64).astype("<u2")
         series = np.diff(numbers, axis=1, prepend=np.zeros((len(numbers), 1), dtype="<u2"))
         return {
@@ -85,6 +86,7 @@ class Shown:
             "rays": rays,
             "outputs": outputs,
             "middle": middle,
+            "points": drive.route.shape[1] if self.stride == 1 else 0,
             "series": base64.b64encode(zlib.compress(series.tobytes(), 9)).decode(),
         }
 

@@ -17,6 +17,7 @@ from evolution.episodes.rollout import RESULT
 from evolution.search.breeding import RECIPE, Kind
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
+from gridsim.state import START_FIELDS
 
 BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; remembers the latest
 
@@ -91,7 +92,7 @@ class Outcome(Call):
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
         super().__init__(task, recipes, asked, len(recipes))
         # States so many steps before the end as `rewind`, and the traffic then, float32 [episodes, cars, world.FIELDS].
-        self.rewound, self.worlds = np.zeros((len(task.episodes), 5), np.float32), np.zeros_like(task.worlds)
+        self.rewound, self.worlds = np.zeros((len(task.episodes), START_FIELDS), np.float32), np.zeros_like(task.worlds)
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         results, rewound, worlds, seconds = answer

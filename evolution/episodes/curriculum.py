@@ -22,7 +22,7 @@ from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
-from gridsim.state import LANE, TRAFFIC_FIELDS, End
+from gridsim.state import LANE, TERMINATES, TRAFFIC_FIELDS, End
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
@@ -170,10 +170,10 @@ class Curriculum:
     ) -> None:
         """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
-        Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 5], and the traffic
+        Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 7], and the traffic
         at that time, float32 [e, cars, TRAFFIC_FIELDS].
         """
-        crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
+        crashed = TERMINATES[results["end"]] & (results["steps"] > 10)
         if crashed.any():
             new = np.zeros(np.count_nonzero(crashed), dtype=EPISODE)
             seeds = np.array(episodes.maps)[episodes.rows["map"][crashed]]

@@ -26,15 +26,16 @@ from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.imperfections import History, late_command, new_history
 from gridsim.sensing.observation import normalise
-from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
 _IDLE = int(End.IDLE)
 
-#: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
-#: target (m of new ground) and time limit (control steps); rewind: if above 0, return the state that many control steps
-#: before the end.
-EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
+#: An episode: index of its map in the task; its start (`state.START_FIELDS`), target (m of new ground) and time limit
+#: (control steps); rewind: if above 0, return the state that many control steps before the end.
+EPISODE = np.dtype(
+    [("map", "<i4"), ("start", "<f4", START_FIELDS), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")]
+)
 
 #: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End. Then the
 #: figures of comfort if they are asked for, else 0: mean square (m2/s4) and largest (m/s2) lateral acceleration, mean
@@ -74,7 +75,7 @@ def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
 class EpisodeSetup(NamedTuple):
     """Start and limits of an episode as kernels read them."""
 
-    start: np.ndarray  # float32 [5]
+    start: np.ndarray  # float32 [7]
     target: np.float32  # m
     steps: int
 
@@ -274,7 +275,7 @@ def _rollout(
 ):  # fmt: skip
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
-    If rewind > 0, also fills rewound [n, 5] and rewound_worlds [n, cars, fields].
+    If rewind > 0, also fills rewound [n, 7] and rewound_worlds [n, cars, fields].
     """
     workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0], command)
     for i in range(genomes.shape[0]):
@@ -327,7 +328,7 @@ def evaluate(
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
     with, float32 [e, cars, TRAFFIC_FIELDS]; whether results have the figures of comfort.
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
-    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
+    start of shorter ones, as starts float32 [n, k, 7]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -339,7 +340,7 @@ def evaluate(
     results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
     kept = np.cumsum(episodes["rewind"] > 0) - 1
     k = int(kept[-1]) + 1 if len(kept) else 0
-    rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
+    rewound = np.zeros((max(k, 1), len(genomes), START_FIELDS), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     simulations = simulations_on(road_maps, config, spec.features)
     notes = np.empty(NOTES, np.float32) if with_comfort else None

@@ -10,7 +10,7 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
-from gridsim.state import TRAFFIC_FIELDS
+from gridsim.state import POSE, TRAFFIC_FIELDS
 from gridsim.traffic.world import spawn
 
 
@@ -48,7 +48,7 @@ def lane_starts(
     episodes["map"], episodes["target"], episodes["steps"] = maps, config.episode.target, config.episode.steps
     on_each = [(road_maps[m], np.flatnonzero(maps == m)) for m in np.unique(maps)]
     for road_map, of in on_each:
-        episodes["start"][of] = sample_starts(road_map, len(of), rng)
+        episodes["start"][of, :POSE] = sample_starts(road_map, len(of), rng)
     if traffic:
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
         for road_map, of in on_each:

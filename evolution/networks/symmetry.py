@@ -8,7 +8,6 @@ serves in a bend to the right.
 
 from __future__ import annotations
 
-import itertools
 from functools import cache
 
 import numpy as np
@@ -17,7 +16,7 @@ from evolution.networks.policy import KERNEL_1, KERNEL_2, SIDE_2, CnnSpec, MlpSp
 from evolution.search.space import Space, Symmetry
 from gridsim.car.vehicle import Action
 from gridsim.jit import freeze
-from gridsim.sensing.observation import FEATURES, encoding
+from gridsim.sensing.observation import mirrored
 
 #: The mirror image of each action.
 MIRRORED_ACTIONS = np.array(
@@ -51,7 +50,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
             units = MIRRORED_ACTIONS if spec.actions == "discrete" else np.arange(2)
             sign[:, 1] = 1.0 if spec.actions == "discrete" else -1.0  # of the wheel
         if k == 0 and isinstance(spec, MlpSpec):
-            sign[:n] *= encoding(spec.features).each(feature.mirror for feature in FEATURES)[:, None]
+            sign[:n] *= mirrored(spec.features)[1][:, None]
         images += [(at + inputs[:, None] * m + units).ravel(), at + n * m + units]
         signs.append(sign.ravel())
         at += (n + 1) * m
@@ -79,8 +78,7 @@ def _inputs(spec: PolicySpec) -> list[np.ndarray]:
             np.arange(dense)[::-1],
         ]
     assert isinstance(spec, MlpSpec)
-    parts = [np.arange(*ends)[::-1] for ends in itertools.pairwise(encoding(spec.features).first)]
-    return [np.concatenate(parts), *(np.arange(m)[::-1] for m in spec.hidden)]
+    return [mirrored(spec.features)[0], *(np.arange(m)[::-1] for m in spec.hidden)]
 
 
 def _columns_reversed(rows: int, columns: int, channels: int) -> np.ndarray:

@@ -4,7 +4,8 @@ Observation:
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
   between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
-  the steering angle as a share of 27 degrees. `gridsim.sensing.observation` has these features.
+  the steering angle as a share of 27 degrees, and `route` four points of a route ahead, float32 [8]
+  (`gridsim.sensing.route`). `gridsim.sensing.observation` has these features.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
@@ -44,6 +45,7 @@ from gridsim.maps.parts import TRAINING_SEED
 from gridsim.maps.scenarios import check_name, default_traffic, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.sensing.observation import OPTIONAL
+from gridsim.sensing.route import points_ahead
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, LANE, SPEED, TERMINATES, TRUNCATES, End
 from gridsim.view.display import has_display
@@ -104,7 +106,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
             config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
-            features: which of `motion` and `steering` rays come with.
+            features: which of `motion`, `steering` and `route` rays come with.
         """
         check_name(scenario)
         for name, value, known in (
@@ -121,8 +123,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         seen = tuple(name for name in OPTIONAL if features.get(name))
         if seen and observation != "rays":
             raise ValueError(f"{' and '.join(seen)}: only for rays; leave them out with observation={observation!r}")
-        if traffic and not has_lanes(scenario):
-            raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
+        if not has_lanes(scenario) and (traffic or "route" in seen):
+            raise ValueError(f"{scenario} has no lanes for traffic or a route; use traffic=0, and not route=True")
         self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
@@ -282,7 +284,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)
         text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m"
         boxes, path = world[world[:, LANE] >= 0.0], np.array(self._paths[i])
-        return self._views[road_map].draw(car, boxes, self.simulator.ranges[i], path, (text,))
+        route = points_ahead(road_map, car[None])[0]
+        return self._views[road_map].draw(car, boxes, self.simulator.ranges[i], path, (text,), route)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """With `rgb_array`, a picture uint8 [height, width, 3] for each car; `human` is drawn by step and reset."""

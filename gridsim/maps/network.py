@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
-from gridsim.jit import HALF, ZERO, F, U, freeze, leaf, njit
+from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
@@ -209,6 +209,16 @@ def lane_length(network, lane):
     """Length (m) of a lane."""
     lane = U(lane)  # unsigned, here and elsewhere: Numba checks whether signed indices are negative
     return F(network.offsets[lane + U(1)] - network.offsets[lane] - 1) * network.steps[lane]
+
+
+@leaf
+def successor(network, lane, number):
+    """The successor of a lane that a uniform random number in [0, 1) chooses."""
+    count = 0
+    for k in range(network.successors.shape[1]):
+        if network.successors[lane, k] >= 0:
+            count += 1
+    return network.successors[lane, min(I(number * F(count)), I(count - 1))]
 
 
 @leaf

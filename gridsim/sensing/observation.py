@@ -13,14 +13,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import ONE, F, U, exact, freeze
-from gridsim.state import SPEED, STEERING
+from gridsim.jit import ONE, ZERO, F, U, exact, freeze
+from gridsim.sensing import route
+from gridsim.sensing.route import AHEAD
+from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
 SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; a perceptron of a small car less (`SimConfig.pace`)
 
 
 class Feature(NamedTuple):
-    """A part of an observation: values in SI units, which in a mirror are in reverse order."""
+    """A part of an observation: values in SI units, or shares."""
 
     name: str
     values: int
@@ -30,6 +32,7 @@ class Feature(NamedTuple):
     least: np.float32 = -ONE  # what the environment returns, at least
     shift: float = 0.0  # added to what networks read
     mirror: float = 1.0  # factor of the values in a mirror
+    reversed: bool = True  # whether their order is reversed in a mirror
     sees: str = ""  # what a network sees that names it, as in `mlp:64+steering`; "": all networks see it
 
 
@@ -41,12 +44,15 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("motion", int(k.rays), *speed, sees="how fast the cars that rays hit approach"),
         Feature("speed", 1, *speed, least=slowest, shift=-1.0),
         Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
+        Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
+        Feature("route", len(AHEAD), ONE, ONE, mirror=-1.0, reversed=False, sees="a route to follow"),
     )
 
 
 USUAL = constants(SimConfig())
 FEATURES = features(USUAL)
-OPTIONAL = tuple(feature.name for feature in FEATURES if feature.sees)
+OPTIONAL = tuple(dict.fromkeys(feature.name for feature in FEATURES if feature.sees))
+ROUTE = [feature.name for feature in FEATURES].index("route")
 
 
 class Encoding(NamedTuple):
@@ -76,6 +82,22 @@ def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
     return Encoding(freeze(np.cumsum([0, *values])), freeze(near > 0.0), *map(freeze, others))
 
 
+def mirrored(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """An observation in a mirror: the index of each value's image, int64 [values], and its factor, float32 [values]."""
+    first = encoding(names).first
+    order = [
+        np.arange(*ends)[:: -1 if feature.reversed else 1]
+        for feature, *ends in zip(FEATURES, first, first[1:], strict=False)
+    ]
+    return np.concatenate(order), encoding(names).each(feature.mirror for feature in FEATURES)
+
+
+@exact
+def sees(encoding, feature):
+    """Whether a feature, by its number, is seen."""
+    return encoding.first[feature] < encoding.first[feature + 1]
+
+
 @exact
 def _put(encoding, feature, values, observation):
     """Write the values of a feature, by its number, if it is seen."""
@@ -92,6 +114,11 @@ def observe(simulation, car, world, ranges, closing, observation):
     _put(encoding, 1, closing, observation)
     _put(encoding, 2, (car[SPEED],), observation)
     _put(encoding, 3, (car[STEERING],), observation)
+    if sees(encoding, ROUTE) and car[ROUTE_KEY] > ZERO:
+        values = observation[encoding.first[ROUTE] :]
+        route.read(simulation, car, values)
+        _put(encoding, ROUTE, values, observation)
+        _put(encoding, ROUTE + 1, values[len(AHEAD) :], observation)
 
 
 @exact

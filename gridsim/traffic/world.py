@@ -16,7 +16,7 @@ from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SP
 from gridsim.counter import GOLDEN, mix, uniform, uniform64
 from gridsim.errors import GridSimError
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
-from gridsim.maps.network import Network, wrapped
+from gridsim.maps.network import Network, successor, wrapped
 
 
 @leaf
@@ -75,11 +75,7 @@ def _draw(car):
 @leaf
 def choose_lane(network, lane, car):
     """A random successor of `lane`."""
-    count = 0
-    for k in range(network.successors.shape[1]):
-        if network.successors[lane, k] >= 0:
-            count += 1
-    return network.successors[lane, min(I(_draw(car) * F(count)), I(count - 1))]
+    return successor(network, lane, _draw(car))
 
 
 @njit(nogil=True)

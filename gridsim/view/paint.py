@@ -22,7 +22,7 @@ EDGE_LINE = (236, 238, 240)
 MARK, MARK_OPPOSITE = (214, 217, 222), (240, 205, 112)
 EGO, OTHER, PARKED = (255, 92, 43), (96, 168, 232), (152, 160, 171)
 GLASS, TYRE, LIGHT = (28, 32, 40), (24, 25, 29), (255, 246, 214)
-RAY, PATH = (92, 225, 200), (233, 172, 86)
+RAY, PATH, ROUTE = (92, 225, 200), (233, 172, 86), (240, 120, 235)
 HUD = (20, 22, 28)
 
 SQUARE = 16.0  # m, side of the ground's squares

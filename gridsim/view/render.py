@@ -81,6 +81,7 @@ class Renderer:
         ranges: np.ndarray | None = None,
         path: np.ndarray | None = None,
         text: Sequence[str] = (),
+        route: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draw a state: uint8 [h, w, 3].
 
@@ -90,6 +91,7 @@ class Renderer:
             ranges: ranges of the car's rays [rays], m.
             path: the car's past positions [n, 2], m.
             text: a line for the lower left, and one for the upper left.
+            route: points of its route [n, 2], m.
         """
         width, height = self.size
         position, heading = np.asarray(car[[X, Y]], np.float64) * self._per_m, np.asarray(car[[COS, SIN]], np.float64)
@@ -103,6 +105,10 @@ class Renderer:
         shapes = [self._mark_shapes(), self._block_shapes()]
         if path is not None:
             shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64) * self._per_m))
+        if route is not None:
+            at = self.pixel(route * self._per_m)
+            flat = np.broadcast_to([1.0, 0.0], at.shape)
+            shapes.append(self._shapes(at, flat, 0.45, 0.45, 0.45, paint.ROUTE, 1.0, 2.0))
         if ranges is not None:
             shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64) * self._per_m))
         if boxes is not None:

@@ -17,10 +17,12 @@ from cluster.report import pictures
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
 from cluster.store.champion import load_champion
+from evolution.networks.policy import PolicySpec
 from gridsim.car.vehicle import act
 from gridsim.config import constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.sensing.route import points_ahead
 from gridsim.state import CAR_FIELDS, COS, DISTANCE, SIN, SPEED, STEERING, X, Y
 from gridsim.traffic.world import spawn
 
@@ -29,7 +31,7 @@ CHAMPION = Path(__file__).parents[2] / "benchmarks/champion_traffic.npz"
 
 def channels(drive):
     """A drive's channels [channels, moments]: sums of differences that wrap at 16 bits, as the script has them."""
-    count = 5 + 3 * drive["cars"] + drive["rays"] + len(drive["outputs"])
+    count = 5 + 3 * drive["cars"] + drive["rays"] + len(drive["outputs"]) + 2 * drive["points"]
     series = np.frombuffer(zlib.decompress(base64.b64decode(drive["series"])), dtype="<u2").reshape(count, -1)
     return np.cumsum(series, axis=1, dtype=np.uint16).astype(float)
 
@@ -72,6 +74,18 @@ def test_pedal_and_wheel_are_shown_from_the_middle():
     packed = replace(shown, drive=replace(drive, outputs=commands)).packed()
     assert (packed["outputs"], packed["middle"]) == (["pedal", "wheel"], 50)
     assert pytest.approx(0.5 + 0.5 * commands * [1, -1], abs=1e-5) == channels(packed)[-2:].T / 65535  # left is left
+
+
+def test_a_page_holds_the_points_of_the_route():
+    road_map, policy = build("city", 3), "mlp:3+route"
+    genome = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)  # accelerates
+    driver = replace(load_champion(CHAMPION), policy=policy, genome=genome)
+    drive = record(driver, road_map, sample_starts(road_map, 1, np.random.default_rng(2))[0], 20.0)
+    points = points_ahead(road_map, drive.cars)
+    assert points.shape == (len(drive.cars), 4, 2)
+    found = channels(Shown("champion", "1", drive).packed())[-8:] / 65536 * float(road_map.road.width)
+    assert np.abs(road_map.shortest(found.T.reshape(-1, 4, 2) - points)).max() < 0.01
+    assert Shown("champion", "1", drive, stride=2).packed()["points"] == 0
 
 
 def shown_drives():

@@ -22,12 +22,26 @@ from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, act_on
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.maps.map import starts_at
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
-from gridsim.sensing.observation import OPTIONAL, encoding, normalise
+from gridsim.sensing.observation import encoding, normalise
 from gridsim.simulator import Simulator
-from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
+from gridsim.state import (
+    ALONG,
+    COS,
+    LANE,
+    ROUTE_KEY,
+    ROUTE_LANE,
+    SHIFT,
+    SIN,
+    SPEED,
+    START_FIELDS,
+    STEERING,
+    TRAFFIC_FIELDS,
+    End,
+    X,
+    Y,
+)  # fmt: skip
 
 F = np.float32
 CONFIG = SimConfig()
@@ -84,7 +98,7 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
 
 def as_start(car):
     """About the start, as in EPISODE, of a car's state."""
-    return pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
+    return pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING, ROUTE_LANE, ROUTE_KEY]]])
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):
@@ -92,14 +106,14 @@ def test_what_is_rewound_goes_on_as_it_did(among):
     spec, genome, maps, episodes, worlds, paths = among
     both = np.stack([genome, np.full_like(genome, np.nan)])  # whose episodes end before their first step
     plain, starts, then = evaluate(spec, both, maps, episodes, CONFIG, worlds)
-    assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
+    assert (starts.shape, then.shape) == ((2, 0, 7), (2, 0, *worlds.shape[1:]))
     crashed = [int(row["end"]) == End.COLLISION for row, _, _ in paths]
     wanted = episodes.copy()
     wanted["rewind"] = np.where(crashed, 64, [0, 1, 5000, 1, 5000, 0, 5000, 0, 1])
     results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds)
     assert results.tobytes() == plain.tobytes()
     kept = np.flatnonzero(wanted["rewind"])
-    assert (starts.shape, then.shape) == ((2, len(kept), 5), (2, len(kept), *worlds.shape[1:]))
+    assert (starts.shape, then.shape) == ((2, len(kept), 7), (2, len(kept), *worlds.shape[1:]))
     for start, world, k in zip(starts[1], then[1], kept, strict=True):
         assert start == as_start(paths[k][1][0])
         assert world.tobytes() == worlds[k].tobytes()
@@ -134,7 +148,7 @@ def test_what_is_rewound_of_an_episode_without_a_step_is_its_start(among):
     both = np.stack([genome, np.full_like(genome, math.nan)])
     results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds[:1])
     assert results["steps"].tolist() == [[60], [0]]
-    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99], abs=1e-4)
+    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99, 99, 99], abs=1e-4)
     assert then[1].tobytes() == worlds[:1].tobytes()
 
 
@@ -224,14 +238,14 @@ def cut_up(experience):
 
 
 def inputs_of(simulator):
-    """What the environment shows of its one car, as a network with all inputs reads it."""
-    inputs = np.zeros(64, dtype=F)
-    normalise(encoding(OPTIONAL), simulator.observations[0], inputs)
+    """What the environment shows of its one car, as a network with these inputs reads it."""
+    inputs = np.zeros(simulator.observations.shape[1], dtype=F)
+    normalise(encoding(simulator.features), simulator.observations[0], inputs)
     return inputs
 
 
 @pytest.mark.parametrize("cars", [0, CARS])
-@pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
+@pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "mlp:5+route", "cnn:8,8,16@3"])
 def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, cars):
     of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
@@ -239,12 +253,12 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
     row, table = 0, grid_table(CONFIG)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
-        simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars, features=OPTIONAL)
+        simulator = Simulator(1, CONFIG, GOAL, MOST, traffic=cars, features=of.spec.features)
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
         ranges, ends = simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
             seen = inputs_of(simulator)
-            shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
+            shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[-1])
             assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
             row += 1
             if step == result["steps"]:
@@ -262,12 +276,12 @@ def test_a_network_reads_the_closing_speeds_that_the_environment_shows():
     road, spec = build("highway", 4), PolicySpec.parse("mlp:3+motion+steering")
     world = cars_on(road.network, (1, 10.0, 25.0, 1.0))
     episode = np.zeros(1, dtype=EPISODE)
-    episode["start"], episode["target"], episode["steps"] = starts_at(road, np.zeros(1)), TARGET, 1
+    episode["target"], episode["steps"] = TARGET, 1
     episode["start"][0, :2] = world[0, [X, Y]] + 20.0 * world[0, [COS, SIN]]
     episode["start"][0, 2:4] = math.atan2(world[0, SIN], world[0, COS]) + math.pi, 20.0
     genome = np.ones(spec.size, F)
     experience, _ = collect(spec, genome, [road], episode, np.zeros(1, F), np.zeros(1, np.uint64), CONFIG, world[None])
-    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1, features=OPTIONAL)
+    simulator = Simulator(1, CONFIG, TARGET, 1, traffic=1, features=spec.features)
     simulator.reset(road, episode["start"], worlds=world[None])
     assert simulator.closing.max() == pytest.approx(45.0, abs=0.1)
     np.testing.assert_allclose(experience.observations[0] / 4096, inputs_of(simulator), rtol=0.0, atol=0.6 / 4096)
@@ -354,7 +368,7 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
     episodes = curriculum.leader_episodes(generation)
     results = np.zeros(len(episodes.rows), dtype=RESULT)
     results["end"], results["distance"], results["steps"] = ends, distance, steps
-    rewound = np.repeat(np.arange(len(results), dtype=np.float32)[:, None], 5, axis=1) + 100.0 * generation
+    rewound = np.repeat(np.arange(len(results), dtype=np.float32)[:, None], START_FIELDS, axis=1) + 100.0 * generation
     curriculum.learn_from_leader(episodes, results, rewound, episodes.worlds)
     return episodes, rewound
 
@@ -421,7 +435,7 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again(curriculum):
 
     def crash_starts(generation):
         """Of each group: [3, 2]."""
-        return curriculum.episodes(generation).rows["start"].reshape(3, 4, 5)[:, 2:, 0]
+        return curriculum.episodes(generation).rows["start"].reshape(3, 4, 7)[:, 2:, 0]
 
     for generation in range(1, 40):
         starts = crash_starts(generation)

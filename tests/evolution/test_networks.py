@@ -4,7 +4,6 @@ import itertools
 import math
 import subprocess
 import sys
-from typing import NamedTuple
 
 import numpy as np
 import onnx
@@ -26,9 +25,11 @@ from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
 from gridsim.errors import GridSimError
+from gridsim.maps.map import blank
 from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.sensing.observation import OPTIONAL, SPEED_SCALE, Encoding, encoding, normalise, observe
+from gridsim.sensing.observation import OPTIONAL, SPEED_SCALE, encoding, normalise, observe
 from gridsim.state import CAR_FIELDS, SPEED, STEERING
+from gridsim.step import simulations_on
 
 F = np.float32
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
@@ -90,15 +91,12 @@ def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
     assert math.isnan(policy.squash(F(math.nan)))
 
 
-class Encoded(NamedTuple):
-    encoding: Encoding
-
-
 def test_what_the_network_sees():
     inputs, seen, ranges, car = np.zeros(33, F), np.zeros(33, F), np.linspace(0, 50, 31), np.zeros(CAR_FIELDS, F)
     car[[SPEED, STEERING]] = 12.5, -0.1
     encoded = encoding(("steering",))
-    observe(Encoded(encoded), car, None, ranges.astype(F), np.zeros(31, F), seen)
+    simulation = simulations_on([blank()], SimConfig(), ("steering",))[0]
+    observe(simulation, car, None, ranges.astype(F), np.zeros(31, F), seen)
     assert seen == pytest.approx([*ranges / 50, 12.5 / 30, -0.1 / math.radians(27)], abs=1e-6)
     normalise(encoded, seen, inputs)
     assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
@@ -210,8 +208,12 @@ def in_a_mirror(spec, observations):
     seen[:, :RAYS] = observations[:, RAYS - 1 :: -1]
     if "motion" in spec.features:
         seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
+    first = spec.inputs
+    if "route" in spec.features:  # points, how far ahead and then how far to the left
+        first -= 8
+        seen[:, -4:] = -observations[:, -4:]
     if "steering" in spec.features:
-        seen[:, -1] = -observations[:, -1]
+        seen[:, first - 1] = -observations[:, first - 1]
     return seen
 
 
@@ -237,7 +239,7 @@ def test_in_a_mirrored_world_the_mirrored_actions_have_the_same_outputs(spec, se
 
 
 @pytest.mark.parametrize("more", ["", "+continuous"])
-@pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:64+steering", "mlp:3+motion+steering", "cnn:8,16,24@2"])
+@pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:64+steering", "mlp:3+motion+steering+route", "cnn:8,16,24@2"])
 def test_every_gene_is_free_or_bound_to_a_free_one(policy, more):
     spec = PolicySpec.parse(policy + more)
     free, bound, source, factor = symmetry(spec)
@@ -299,7 +301,7 @@ def rays(spec):
 
 
 @CONFIGS
-@pytest.mark.parametrize("text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering"])
+@pytest.mark.parametrize("text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering+route"])
 def test_perceptrons_give_the_kernels_outputs(text, config):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, MlpSpec)
@@ -329,7 +331,7 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
 
 @CONFIGS
 @pytest.mark.parametrize("more", ["", "+continuous"])
-@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering", "cnn:8,8,24@2"])
+@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering+route", "cnn:8,8,24@2"])
 def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, more, config, tmp_path):
     text += more
     genome = np.random.default_rng(7).normal(0.0, 0.2, PolicySpec.parse(text).size).astype(F)

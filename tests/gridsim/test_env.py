@@ -52,7 +52,12 @@ def test_type_checkers_see_the_names_that_are_there(root: Path) -> None:
     assert {ast.unparse(node.target) for node in others} <= vars(gridsim).keys()
 
 
-SEES: list[dict[str, Any]] = [{"motion": motion, "steering": steering} for motion in (0, 1) for steering in (0, 1)]
+SEES: list[dict[str, Any]] = [
+    {},
+    {"motion": True},
+    {"steering": True},
+    {"motion": True, "steering": True, "route": True},
+]
 SEES += [{"observation": observation, "frames": frames} for observation in ("grid", "image") for frames in (1, 4)]
 
 
@@ -72,7 +77,7 @@ def test_gymnasiums_checker_passes_without_a_display(maps: Maps, name: str, sees
     ("name", "options"),
     [
         ("highway", {}),
-        ("seamless", {"traffic": 6, "actions": "continuous"}),
+        ("seamless", {"traffic": 6, "actions": "continuous", "route": True}),
         ("roundabout", {"observation": "image", "frames": 4}),
         ("city", {"observation": "image", "actions": "continuous"}),
     ],
@@ -371,6 +376,7 @@ def test_steps_and_pictures_need_a_reset(maps: Maps) -> None:
         ({"motion": True, "observation": "image"}, "leave them out with observation='image'"),
         ({"traffic": -1}, "not -1"),
         ({"traffic": 3, "scenario": "no/map.yaml"}, "no lanes for traffic"),
+        ({"route": True, "scenario": "no/map.yaml"}, "no lanes for traffic or a route"),
         ({"scenario": "no/map.yaml"}, "no/map.yaml"),
         ({"autoreset_mode": "never"}, "'never' is not a valid AutoresetMode"),
         ({"options": {"seed": 1}}, "unknown option 'seed'"),
