@@ -64,7 +64,12 @@ def add_drives(app: Sphinx, error: Exception | None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         gridsim.evolve(scenario="curved", folder=f"{folder}/first")
         shutil.copy(f"{folder}/first/drive.html", drives / "first.html")
-    watch = [Path(sys.executable).with_name("gridsim-watch"), "champion_traffic.npz", "--output", drives / "traffic.html"]
+    watch = [
+        Path(sys.executable).with_name("gridsim-watch"),
+        "champion_traffic.npz",
+        "--output",
+        drives / "traffic.html",
+    ]
     subprocess.run(watch, cwd=Path(__file__).parents[1] / "benchmarks", check=True)
 
 
