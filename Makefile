@@ -16,7 +16,7 @@ PORT   ?= 5000
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install develop evolve dqn compare test test-slow ui bench results pictures lint format
+.PHONY: help install develop evolve dqn compare test test-slow ui bench results pictures docs lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
@@ -54,6 +54,10 @@ results: $(DEV) ## Measure the tables of docs/results.md again, in two and a hal
 
 pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again
 	$(BIN)/python docs/pictures.py
+
+docs: $(DEV) ## Build the documentation's site, build/site/index.html, in a minute
+	@rm -rf build/site
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/sphinx-build -W --keep-going -q docs build/site
 
 lint: $(DEV) ## Check style, format and types
 	$(BIN)/ruff check .

@@ -37,6 +37,7 @@ IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
 
 ROADS = f"{', '.join(REGISTRY)}, or a file of a map or a road, or a folder of them (docs/roads.md)."
+SCENARIO = tyro.conf.arg(help=f"Road to learn on: {ROADS}")
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -50,7 +51,7 @@ class RunSettings(ABC):
     step_name: ClassVar[str]  # what a step of learning is called
     verb: ClassVar[str]  # what is done to a network
 
-    scenario: Annotated[str, tyro.conf.arg(help=f"Road to learn on: {ROADS}")] = "seamless"
+    scenario: Annotated[str, SCENARIO] = "seamless"
     traffic: Annotated[int, IN_WORDS] = -1
     """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
     sim: str = "default"

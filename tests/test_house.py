@@ -136,7 +136,7 @@ def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path
 
     for target in ("install", "evolve", "dqn", "compare", "ui", "bench", "pictures"):
         assert installs(target) == [".[evolve]"]
-    for target in ("develop", "test", "lint", "format"):
+    for target in ("develop", "test", "docs", "lint", "format"):
         assert installs(target) == [".[dev]"]
     assert f"touch {tmp_path}/.installed {tmp_path}/.installed-dev" in said("test")  # it has what a user needs, too
     (tmp_path / ".installed").touch()

@@ -1,5 +1,6 @@
-"""What the pages show runs: README.md's commands, small ones here and others `ELSEWHERE`, and all Python examples."""
+"""What the pages show runs: commands of some, small ones here and others `ELSEWHERE`, and all Python examples."""
 
+import os
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from commands import BIN, finish
 SMALL = "--scenario curved --traffic 0 --population 16 --car-steps 3000"
 COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --output"
 
+PAGES = ("README.md", "docs/start.md", "docs/paper.md")
 # What is run here, in this order, and what is added to make it small; the last of equal flags counts.
 HERE = {
     "make evolve": f"{SMALL} --name first",
@@ -27,8 +29,16 @@ HERE = {
     ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
     ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
     ".venv/bin/gridsim-watch runs/<name> --generation 12": "--generation 0 --output elite.html",
+    "gridsim-evolve --scenario curved --name first": f"{SMALL} --name begun",
+    "gridsim-watch runs/first --output first.mp4": "--size 160x90 --seconds 2",
+    "gridsim-evaluate runs/first --episodes 256": "--episodes 4",
+    "gridsim-evaluate runs/first --scenario seamless --episodes 256": "--episodes 4",
+    "gridsim-evolve --name second": SMALL,
+    "gridsim-evolve --policy mlp:6,7 --recombination two": f"{SMALL} --name paper",
+    "gridsim-evolve --policy mlp:6,7": SMALL,
 }
 ELSEWHERE = {
+    "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
     "make test": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
     ".venv/bin/gridsim-watch runs/<name>": "tests/cluster/test_watch.py::test_window_is_shown_on_a_chosen_driver",
@@ -67,8 +77,8 @@ def examples(root: Path) -> dict[str, str]:
     return {page.name: text for page in pages if (text := code(page, "python"))}
 
 
-def test_every_command_of_the_readme_is_run_by_a_test(root: Path) -> None:
-    lines = code(root / "README.md", "sh").splitlines()
+def test_every_command_of_the_pages_is_run_by_a_test(root: Path) -> None:
+    lines = [line for page in PAGES for line in code(root / page, "sh").splitlines()]
     assert {line.partition("#")[0].strip() for line in lines} - {""} == {*HERE, *ELSEWHERE}
     for test in ELSEWHERE.values():
         file, name = test.split("::")
@@ -76,7 +86,10 @@ def test_every_command_of_the_readme_is_run_by_a_test(root: Path) -> None:
 
 
 @pytest.mark.e2e
-def test_the_commands_of_the_readme_run_and_then_the_examples_of_all_pages(root: Path, tmp_path: Path) -> None:
+def test_the_commands_of_the_pages_run_and_then_the_examples_of_all_pages(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(BIN), prepend=os.pathsep)
     make = f"make -f {root}/Makefile -o {sys.prefix}/.installed VENV={sys.prefix} "
     for command, small in HERE.items():
         line = command.replace("<name>", "first").replace("<other>", "other").replace(".venv/bin", str(BIN))

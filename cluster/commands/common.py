@@ -173,8 +173,12 @@ def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoRe
 
 
 def new_console(stderr: bool = False) -> Console:
-    """A console that prints names as they are: brackets and colons in them mean nothing."""
-    return Console(stderr=stderr, markup=False, emoji=False)
+    """A console that prints names as they are: brackets and colons in them mean nothing.
+
+    In a notebook (`!gridsim-evolve`), output claims to be a terminal, but a line cannot be written over.
+    """
+    plain = False if "JPY_PARENT_PID" in os.environ else None  # Jupyter's kernels set it, in Colab, too
+    return Console(stderr=stderr, markup=False, emoji=False, force_terminal=plain)
 
 
 def short_path(path: Path) -> str:

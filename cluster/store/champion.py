@@ -37,11 +37,11 @@ GONE = ("apart", "kerb")  # former parameters of traffic, which champions of the
 class Champion:
     """A genome and what is needed to run it. Champions are equal if all of that is, the genome bit for bit."""
 
-    genome: np.ndarray  # float32 [genes]
-    policy: str  # its network, such as `mlp:6,7`
-    scenario: str  # where it learned
-    sim: SimConfig  # the simulator's parameters it learned with
-    traffic: int = 0  # other cars that it learned among
+    genome: np.ndarray  #: float32 [genes]
+    policy: str  #: its network, such as `mlp:6,7`
+    scenario: str  #: where it learned
+    sim: SimConfig  #: the simulator's parameters it learned with
+    traffic: int = 0  #: other cars that it learned among
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
