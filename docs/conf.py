@@ -30,7 +30,7 @@ myst_heading_anchors = 3
 # The notebook is run anew by each build, in a folder that is then deleted.
 nb_execution_mode = "force"
 nb_execution_in_temp = nb_execution_raise_on_error = True
-nb_execution_timeout = 180  # s
+nb_execution_timeout = 400  # s
 nb_merge_streams = True
 
 # Docstrings put code between single backquotes, and flags in plain text.

@@ -22,7 +22,7 @@ def test_the_notebook_runs_and_commands_print_plain_lines_there(
     monkeypatch.setenv("PATH", str(BIN), prepend=os.pathsep)
     notebook = nbformat.read(root / "docs/first_driver.ipynb", as_version=4)
     notebook.cells.append(nbformat.v4.new_code_cell(COMMAND))
-    NotebookClient(notebook, timeout=180, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    NotebookClient(notebook, timeout=400, resources={"metadata": {"path": str(tmp_path)}}).execute()
     install, *cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert install.outputs == [], "nothing is installed where GridSim is"
     shown = {kind for cell in cells for output in cell.outputs for kind in output.get("data", ())}

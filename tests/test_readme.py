@@ -12,7 +12,6 @@ from commands import BIN, finish
 SMALL = "--scenario curved --traffic 0 --population 16 --car-steps 3000"
 COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --output"
 
-PAGES = ("README.md", "docs/start.md", "docs/paper.md")
 # What is run here, in this order, and what is added to make it small; the last of equal flags counts.
 HERE = {
     "make evolve": f"{SMALL} --name first",
@@ -29,13 +28,19 @@ HERE = {
     ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
     ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
     ".venv/bin/gridsim-watch runs/<name> --generation 12": "--generation 0 --output elite.html",
-    "gridsim-evolve --scenario curved --name first": f"{SMALL} --name begun",
-    "gridsim-watch runs/first --output first.mp4": "--size 160x90 --seconds 2",
-    "gridsim-evaluate runs/first --episodes 256": "--episodes 4",
-    "gridsim-evaluate runs/first --scenario seamless --episodes 256": "--episodes 4",
-    "gridsim-evolve --name second": SMALL,
-    "gridsim-evolve --policy mlp:6,7 --recombination two": f"{SMALL} --name paper",
-    "gridsim-evolve --policy mlp:6,7": SMALL,
+}
+TUTORIALS = {
+    "docs/start.md": {
+        "gridsim-evolve --scenario curved --name first": SMALL,
+        "gridsim-watch runs/first --output first.mp4": "--size 160x90 --seconds 2",
+        "gridsim-evaluate runs/first --episodes 256": "--episodes 4",
+        "gridsim-evaluate runs/first --scenario seamless --episodes 256": "--episodes 4",
+        "gridsim-evolve --name second": SMALL,
+    },
+    "docs/paper.md": {
+        "gridsim-evolve --policy mlp:6,7 --recombination two": f"{SMALL} --name paper",
+        "gridsim-evolve --policy mlp:6,7": SMALL,
+    },
 }
 ELSEWHERE = {
     "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
@@ -77,28 +82,38 @@ def examples(root: Path) -> dict[str, str]:
     return {page.name: text for page in pages if (text := code(page, "python"))}
 
 
+def run_all(commands: dict[str, str], root: Path, cwd: Path) -> None:
+    """Run a page's commands, each made small."""
+    make = f"make -f {root}/Makefile -o {sys.prefix}/.installed VENV={sys.prefix} "
+    shell = os.environ | {"PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    for command, small in commands.items():
+        line = command.replace("<name>", "first").replace("<other>", "other").replace(".venv/bin", str(BIN))
+        if target := re.fullmatch(r'make (\w+)(?: ARGS="?(.*?)"?)?', line):
+            line = f'{make} {target[1]} ARGS="{target[2] or ""} {small}"'
+        else:
+            line = f"{line} {small}"
+        done = subprocess.run(line, shell=True, cwd=cwd, env=shell, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+
+
 def test_every_command_of_the_pages_is_run_by_a_test(root: Path) -> None:
-    lines = [line for page in PAGES for line in code(root / page, "sh").splitlines()]
-    assert {line.partition("#")[0].strip() for line in lines} - {""} == {*HERE, *ELSEWHERE}
+    lines = [line for page in ("README.md", *TUTORIALS) for line in code(root / page, "sh").splitlines()]
+    run_here = [command for commands in (HERE, *TUTORIALS.values()) for command in commands]
+    assert {line.partition("#")[0].strip() for line in lines} - {""} == {*run_here, *ELSEWHERE}
     for test in ELSEWHERE.values():
         file, name = test.split("::")
         assert re.search(rf"def {name}", (root / file).read_text(encoding="utf-8")), test
 
 
 @pytest.mark.e2e
-def test_the_commands_of_the_pages_run_and_then_the_examples_of_all_pages(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PATH", str(BIN), prepend=os.pathsep)
-    make = f"make -f {root}/Makefile -o {sys.prefix}/.installed VENV={sys.prefix} "
-    for command, small in HERE.items():
-        line = command.replace("<name>", "first").replace("<other>", "other").replace(".venv/bin", str(BIN))
-        if target := re.fullmatch(r'make (\w+)(?: ARGS="?(.*?)"?)?', line):
-            line = f'{make} {target[1]} ARGS="{target[2] or ""} {small}"'
-        else:
-            line = f"{line} {small}"
-        done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+@pytest.mark.parametrize("page", TUTORIALS)
+def test_the_commands_of_tutorials_run(page: str, root: Path, tmp_path: Path) -> None:
+    run_all(TUTORIALS[page], root, tmp_path)
+
+
+@pytest.mark.e2e
+def test_the_commands_of_the_readme_run_and_then_the_examples_of_all_pages(root: Path, tmp_path: Path) -> None:
+    run_all(HERE, root, tmp_path)
     for program in examples(root).values():
         for text, small in IN_PYTHON.items():
             program = program.replace(text, small)
