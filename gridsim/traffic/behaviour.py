@@ -415,10 +415,10 @@ def step_traffic(network, drivers, world, ego):
                 else:
                     gap = line + drivers.jam - config.STOP_LINE_GAP
                     pace = min(pace, idm(drivers, car[s.SPEED], desired, gap, ZERO))
-                    if is_junction(network, lane) and car[s.SPEED] < config.WALKING_PACE:
-                        car[s.PERMIT] -= ONE
-                        if -car[s.PERMIT] * drivers.dt > config.GRIDLOCK:
-                            car[s.LANE] = -ONE
+                    waits = is_junction(network, lane) and car[s.SPEED] < config.STANDING
+                    car[s.PERMIT] = car[s.PERMIT] - ONE if waits else -ONE
+                    if -car[s.PERMIT] * drivers.dt > config.GRIDLOCK:
+                        car[s.LANE] = -ONE
         car[s.ACCELERATION] = pace
     for i in range(cars):
         if world[i, s.LANE] >= ZERO:

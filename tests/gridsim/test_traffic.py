@@ -312,13 +312,13 @@ def test_a_junction_is_left_free_while_there_is_no_room_behind(crossing):
     assert 5 in history[:, -1, LANE]  # and the crossing way is open
 
 
-def test_a_car_that_waits_in_a_junction_for_long_is_taken_away(crossing):
+def test_a_car_that_stands_in_a_junction_for_long_is_taken_away(crossing):
     """Else two cars in a junction that wait for each other would stop all traffic for ever."""
     world = cars_on(crossing, (1, 6.0, 0.0, 1.0), (1, 0.5, 0.0, 0.0))
     world[0, [state.NEXT, state.SECOND_NEXT]] = 4, 5  # across the way of the other one, which never moves
-    history = watch(crossing, world, 40)
+    history = watch(crossing, world, 70)
     gone = np.flatnonzero(history[:, 0, LANE] < 0)
-    assert 30.0 < gone[0] * DT < 33.0
+    assert 45.0 < gone[0] * DT < 60.0
     assert (history[:, 1, LANE] == 1).all()
 
 
