@@ -316,9 +316,9 @@ def test_a_car_that_stands_in_a_junction_for_long_is_taken_away(crossing):
     """Else two cars in a junction that wait for each other would stop all traffic for ever."""
     world = cars_on(crossing, (1, 6.0, 0.0, 1.0), (1, 0.5, 0.0, 0.0))
     world[0, [state.NEXT, state.SECOND_NEXT]] = 4, 5  # across the way of the other one, which never moves
-    history = watch(crossing, world, 70)
+    history = watch(crossing, world, 90)
     gone = np.flatnonzero(history[:, 0, LANE] < 0)
-    assert 45.0 < gone[0] * DT < 60.0
+    assert 60.0 < gone[0] * DT < 75.0
     assert (history[:, 1, LANE] == 1).all()
 
 
