@@ -153,5 +153,8 @@ class Evolution(Learning):
         self.search.restore(named(arrays, "search_"))
         self.search.generation = meta["generation"]
         for name in CRASHES:
-            setattr(self.curriculum, name, arrays[name])
+            here, saved = getattr(self.curriculum, name), arrays[name]
+            if (here.dtype, here.shape[1:]) != (saved.dtype, saved.shape[1:]):
+                raise ValueError(f"{name} of another form")
+            setattr(self.curriculum, name, saved)
         self.curriculum.target = meta["target"]

@@ -74,6 +74,15 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
     assert (ended.genome.tobytes(), ended.score) == (other.genome.tobytes(), other.score)
 
 
+def test_crashes_of_an_older_form_are_refused_at_once(maps):
+    """And not in the first generation that begins at one of them."""
+    learning = begin(maps)
+    arrays, meta = learning.state()
+    older = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
+    with pytest.raises(ValueError, match="crashes of another form"):
+        learning.restore({**arrays, "crashes": np.zeros(0, dtype=older)}, meta, learning.table())
+
+
 def test_a_search_is_what_was_asked_for(maps):
     for settings, kind in ((SETTINGS, Recombination), (TWO, TwoParents), (RANDOM, TwoParents)):
         search = begin(maps, settings).search
