@@ -46,6 +46,8 @@ from gridsim.state import (
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
 
 _VISIT_SCALE = F(1.0 / VISIT_CELL)
+# Cosine and sine of the direction that tells the two ways of a street apart; few streets lie at right angles to it.
+_WAY = F(0.93), F(0.37)
 
 
 class Simulation(NamedTuple):
@@ -93,7 +95,7 @@ def visit_cell(road, x, y, cosine, sine):
     column = min(max(I(x * scale), I(0)), columns - I(1))
     row = min(max(I(y * scale), I(0)), rows - I(1))
     cell = row * columns + column
-    if road.ways > ONE and F(0.93) * cosine + F(0.37) * sine < ZERO:  # few streets run at right angles to that
+    if road.ways > ONE and _WAY[0] * cosine + _WAY[1] * sine < ZERO:
         cell += rows * columns
     return cell
 

@@ -3,7 +3,7 @@
 Unknown pixels are wall, and so is everything outside the picture. World coordinates have their origin at the picture's
 lower left corner; a file's own coordinates are turned and shifted by its `origin`.
 
-A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
+A file gives the same road for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
 """
 

@@ -116,4 +116,4 @@ def held_out_place(name: str, held_out: Map) -> str:
     files = [Path(file).name for file in divided(name)[2]]
     if files_of(name) != [name]:
         return f"held-out maps: {', '.join(files[:3])}" + (f" and {len(files) - 3} more" if len(files) > 3 else "")
-    return "this map, from regions of its own" if len(held_out.begins) else "this map, from the same starts"
+    return "this map, from held-out regions" if len(held_out.begins) else "this map, from the starts of training"

@@ -35,6 +35,11 @@ def picture(shape=distance, width=W, height=H, ppm=PPM):
     return np.clip(127.5 + 255 * ppm * d, 0, 255).round().astype(np.uint8)
 
 
+def ring(radius, half_width):
+    """Pixels of a ring of road."""
+    return picture(lambda x, y: half_width - np.abs(np.hypot(x - 45, y - 45) - radius), 90.0, 90.0)
+
+
 def save(path, pixels):
     Image.fromarray(pixels).save(path)
     return str(path)
