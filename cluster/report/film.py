@@ -136,7 +136,10 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
 
 
 def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]) -> int:
-    """Pipe pictures through ffmpeg. Returns their number. Raises WriteError if there is no ffmpeg or it fails."""
+    """Pipe pictures through ffmpeg. Returns their number. Raises WriteError if there is no ffmpeg or it fails.
+
+    imageio-ffmpeg's own writer ignores ffmpeg's exit code: a full disk would leave a film that looks finished.
+    """
     from imageio_ffmpeg import get_ffmpeg_exe
 
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
