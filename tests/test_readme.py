@@ -44,7 +44,6 @@ TUTORIALS = {
 }
 ELSEWHERE = {
     "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
-    "make test": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
     ".venv/bin/gridsim-watch runs/<name>": "tests/cluster/test_watch.py::test_window_is_shown_on_a_chosen_driver",
     ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_any_elite_is_watched",
