@@ -26,7 +26,7 @@ from gridsim.errors import GridSimError
 Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
 """From results [n, episodes] and targets (m): scores [n], higher is better."""
 
-_given: dict[str, Fitness] = {}  # from Python, by name
+_given: dict[str, Fitness] = {}  # functions that were given as objects, by their names
 
 
 def give(function: Fitness) -> str:
@@ -81,7 +81,7 @@ def _file(name: str) -> Path:
         return Path(source)
     first, *others = source.split(".")
     with _working_folder():
-        found = importlib.util.find_spec(first)  # not of `a.b`, for which Python would run `a`
+        found = importlib.util.find_spec(first)  # of `a.b` only `a`: to find all of it, Python would run `a`
     if not found or not found.origin:
         raise ValueError
     path = Path(found.origin).parent.joinpath(*others) if others else Path(found.origin)

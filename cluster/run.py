@@ -38,7 +38,7 @@ from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VAL
 from evolution.episodes.figures import summarise
 from gridsim.maps.parts import held_out_place
 
-WAIT_FOR_MLFLOW_S = 30.0  # for the id of MLflow's run, which summary.json holds
+WAIT_FOR_MLFLOW_S = 30.0  # at most, for MLflow's id of the run, which summary.json has to hold
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def train(
         raise
     finally:
         if status == "KILLED":
-            with contextlib.suppress(OSError, SystemExit):  # by rich, if what reads the output has ended, too
+            with contextlib.suppress(OSError, SystemExit):  # of rich, if the reader of our output has ended
                 on_event(Event("stopping; a moment ..."))
         if pool:
             pool.close()
@@ -127,7 +127,7 @@ class Session:
     tracking: Tracking
     on_event: Callable[[Event], None]
     on_row: Callable[[int, dict[str, float]], None]
-    started: float  # from which its time counts, of `perf_counter`
+    started: float  # `perf_counter` at which the run's time began; earlier if it was resumed
     wall_limit_s: float
     initial: np.ndarray | None
     summary: dict[str, Any] = field(default_factory=dict)  # what summary.json holds, once it is finished
@@ -147,7 +147,7 @@ class Session:
                 raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
             self.started -= learning.history[-1]["wall_s"] if learning.history else 0.0
             self._steps.write_history(rows)
-        self._state: State | None = None  # after the last step, if it is not saved yet
+        self._state: State | None = None  # the learner's after the last step; None once that is saved
         self._saved_at = -math.inf
         self._away = False  # whether an outage of MLflow was reported
         self.maps.ahead([*learning.curriculum.map_seeds[:3], *VALIDATION_SEEDS])
@@ -159,11 +159,11 @@ class Session:
     def learn(self) -> None:
         """Learn to the end, saving once a second and at the end."""
         learning = self.learning
-        if math.isfinite(self.wall_limit_s):  # of learning: a learner that takes longer to start gets as much
+        if math.isfinite(self.wall_limit_s):  # a limit is for learning alone, so that a slow start takes none of it
             self.started = perf_counter() - (learning.history[-1]["wall_s"] if learning.history else 0.0)
         learning.deadline = self.started + self.wall_limit_s
         if not learning.done():
-            (self.run.path / SUMMARY).unlink(missing_ok=True)  # of a run that is extended
+            (self.run.path / SUMMARY).unlink(missing_ok=True)  # a run that is extended is unfinished again
         try:
             while not learning.done() and not (learning.steps and learning.out_of_time()):
                 for event in learning.step():

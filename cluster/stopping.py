@@ -14,7 +14,7 @@ from types import FrameType
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code of a command that was stopped
-ONE_SIGNAL_S = 0.5  # in which signals count as one: `make` and `uv run` pass on what a terminal sends
+ONE_SIGNAL_S = 0.5  # signals within this time count as one: `make` and `uv run` repeat what the terminal sends
 _asked_at: float | None = None  # when the first signal came; `time.monotonic`
 _terminals: list[int] = []  # file descriptors that were a terminal
 

@@ -62,7 +62,7 @@ def _closed(folder: Path) -> Path:
     """A folder, made if missing. Raises: OSError if it is a link, or others may change what is in it."""
     user = os.geteuid()
     trusted = {user, 0, os.stat("/").st_uid}  # in a container, another user may stand for root
-    for path in (*reversed(folder.parents), folder):  # from the top, so that nothing is made where others lead to
+    for path in (*reversed(folder.parents), folder):  # from the top: below a folder of others, nothing is made
         if not os.path.lexists(path):
             with contextlib.suppress(FileExistsError):
                 path.mkdir(mode=0o700)

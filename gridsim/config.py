@@ -24,18 +24,18 @@ _F = np.float32
 FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; see `SimConfig.file_speeds`
 # In units (`SimConfig.unit`), which are metres but for small cars.
 SUBSTEP = _F(1.0)  # a car moves between collision checks, at most
-REENTRY = _F(12.0)  # driven; returning to a cell within this distance still counts as the same visit
+REENTRY = _F(12.0)  # a car that returns to a cell within this distance driven is still on the same visit
 
 # Lanes. Own choices, unless a source is named.
 CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
 
 # Traffic, besides `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
-TRAFFIC_PACE = 0.5  # traffic's speed on a straight, as a share of lower + upper speed: the middle of the interval
-SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
+TRAFFIC_PACE = 0.5  # traffic's speed on a straight / (lower + upper end of the speed interval): its middle
+SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed = lane's speed * (0.9 to 1.2, uniform)
 SPAWN_SPEED = _F(0.5)  # share of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = 1.0  # s between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
-NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance: tolerance of the ego car's lane, judged along a straight line
+NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance: tolerance, as the ego car's lane is judged along a straight line
 # A car looks ahead the jam distance, LOOK_AHEAD m, the distance driven in LOOK_AHEAD_TIME s, and that of braking.
 LOOK_AHEAD, LOOK_AHEAD_TIME = _F(8.0), _F(1.5)
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
@@ -45,7 +45,7 @@ STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
 LANE_CHANGE_ALONE = _F(20.0)  # m within which only one car at a time changes to or from a lane
 KEEP_LANE = _F(30.0)  # m before a junction, or where lanes part, within which cars stay in their lane
 WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
-JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a conflict before the other lane is free
+JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a crossing before the other lane is free
 
 # How traffic meets the ego car.
 MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
@@ -59,9 +59,9 @@ STANDING = _F(0.1)  # m/s below which a car stands
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
-EGO_BEHIND = _F(2.5)  # m to the side within which the ego car, if it is behind, follows a car
+EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
-EGO_SECTOR_COSINE = _F(0.6)  # of the angle from the ego car's heading within which it may soon be
+EGO_SECTOR_COSINE = _F(0.6)  # the ego car may soon be within this angle (as a cosine) of its heading
 
 
 @dataclass(frozen=True)
@@ -108,10 +108,10 @@ class EpisodeConfig:
     """When an episode ends, and what counts as distance."""
 
     control_period: float = quantity(0.1, 0.005, 1.0, "s")
-    target: float = quantity(2000.0, 0.1, 1e6, "m")  # of new ground: success
+    target: float = quantity(2000.0, 0.1, 1e6, "m")  # of new ground, at which an episode succeeds
     time_limit: float = quantity(400.0, 0.1, 1e5, "s")
-    patience: float = quantity(1.5, 0.01, 1e6, "s")  # idle, which end an episode (the paper's sanity check)
-    progress: float = quantity(0.5, 0.0, 100.0, "m/s")  # of new ground; less is idle
+    patience: float = quantity(1.5, 0.01, 1e6, "s")  # of idling after which an episode ends (the paper's sanity check)
+    progress: float = quantity(0.5, 0.0, 100.0, "m/s")  # new ground per time below which a car idles
     revisit: float = quantity(200.0, 0.0, 1e6, "m")  # driven before the same ground counts again
 
     @property
@@ -131,8 +131,8 @@ class TrafficConfig:
     jam: float = quantity(2.0, 0.1, 100.0, "m")  # bumper to bumper at standstill, s0 of IDM
     lateral: float = quantity(3.0, 0.1, 50.0, "m/s2")  # lateral acceleration in bends
     politeness: float = quantity(0.2, 0.0, 10.0)  # p of MOBIL
-    threshold: float = quantity(0.2, 0.0, 50.0, "m/s2")  # that a lane change must gain
-    safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # of braking that a lane change may force on the car behind
+    threshold: float = quantity(0.2, 0.0, 50.0, "m/s2")  # acceleration that a lane change must gain
+    safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # most that a lane change may make the car behind brake
     lane_change_speed: float = quantity(1.25, 0.1, 10.0, "m/s")  # sideways, at most
     verge: float = quantity(0.3, 0.0, 10.0, "m")  # from the road's edge to a car that has moved to the right, at least
     give_way: float = quantity(0.9, 0.0, 10.0, "m")  # to the right for oncoming cars, at most

@@ -19,7 +19,7 @@ from gridsim.sensing.route import check_lanes
 from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 
-MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
+MOST_MAPS = 256  # above that, maps without cars leave the atlas; a map takes some 2 MB, at most 8
 
 
 Physics = tuple[Atlas, tuple[Any, ...]]  # several maps, and the `step.parameters`
@@ -142,9 +142,9 @@ class Simulator:
             np.zeros((cars, delays.readings, 2, rays), dtype=np.float32),
             np.zeros((cars, delays.commands, 2), dtype=np.float32),
         )
-        self.maps: dict[int, Map] = {}  # of each car that was reset
+        self.maps: dict[int, Map] = {}  # the map of each car that was reset
         self._row_of: dict[Map, int] = {}  # the maps in the atlas
-        self._rows = np.full(cars, -1)  # of each car's map in the atlas
+        self._rows = np.full(cars, -1)  # row of each car's map in the atlas
         self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ STEPS = 11  # control steps
 CELL = 12  # index of the visit cell the car is in
 FRESH = 13  # 1 if this cell's ground is new
 YAW_RATE, SLIP = 14, 15  # rad/s, and rad between heading and course, of a dynamic vehicle model; else 0
-ROUTE_LANE, ROUTE_ALONG = 16, 17  # where on its route it is: a lane, and m along it
+ROUTE_LANE, ROUTE_ALONG = 16, 17  # the car's place on its route: a lane, and m along it
 ROUTE_KEY = 18  # decides which lanes come after that one, a whole number; 0 without a route
 CAR_FIELDS = 19
 
@@ -34,7 +34,7 @@ JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
 PERMIT = 10  # junction lane that it may enter next; below 0 none: -1 less the steps for which it stands in a junction
 SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
 SPEED_FACTOR = 12  # its desired speed, relative to the lane's
-SEED = 13  # of its random turns, below 2 ** 24
+SEED = 13  # seed of its random turns, below 2 ** 24
 DRAWS = 14  # random numbers drawn so far, one a lane
 ACCELERATION = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step

@@ -46,7 +46,8 @@ from gridsim.state import (
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
 
 _VISIT_SCALE = F(1.0 / VISIT_CELL)
-# Cosine and sine of the direction that tells the two ways of a street apart; few streets lie at right angles to it.
+# A direction (cosine, sine). Whether a car heads along it or against it tells the two ways of a street apart; few
+# streets lie at right angles to it.
 _WAY = F(0.93), F(0.37)
 
 
@@ -57,9 +58,9 @@ class Simulation(NamedTuple):
     network: Network
     constants: Constants
     drivers: Drivers
-    fan: np.ndarray  # of `rays.fan`
+    fan: np.ndarray  # directions of the rays (`rays.fan`)
     model: Any  # `Parameters` of the vehicle's model
-    imperfections: Imperfections | None  # of the sensor
+    imperfections: Imperfections | None  # None: the sensor is perfect
     delays: Delays | None
     encoding: Encoding
 

@@ -33,9 +33,9 @@ from gridsim.packages import DISTRIBUTION
 COMPARISON = "comparison.json"
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
 UNLIMITED = MAX_STEPS  # generations or car-steps of a run that its wall time ends
-CAR_STEPS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}  # in units of a budget
-SECONDS = {"s": 1, "min": 60, "h": 3600}
-EVALUATIONS = 10  # of the DQN, at least
+CAR_STEPS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}  # car-steps of each unit of --budget
+SECONDS = {"s": 1, "min": 60, "h": 3600}  # the same for units of time
+EVALUATIONS = 10  # that the DQN makes within a budget of car-steps, at least
 # Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
 PLANNED = (
     "scenario", "sim", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",

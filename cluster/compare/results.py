@@ -99,6 +99,6 @@ def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic:
         stopping.check()
         road = roads[row["map"]]
         _, states, _ = trajectory(spec, champion.genome, road, row["start"], episode.target, episode.steps, sim, world)
-        with contextlib.suppress(ValueError):  # not a metre forward
+        with contextlib.suppress(ValueError):  # raised if the car did not drive a metre forward
             found.append(error_series(poses_of(states), road, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

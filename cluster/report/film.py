@@ -44,8 +44,8 @@ class Recording:
     cars: np.ndarray  # float32 [steps + 1, FIELDS], the car's states (`gridsim.state`)
     ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
-    end: End  # how it ended; RUNNING if only the recording did
-    sim: SimConfig  # with which it was driven
+    end: End  # how the drive ended; RUNNING if the recording was stopped first
+    sim: SimConfig  # the simulator's parameters during the drive
     outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], the network's, if they are known
 
     @property
@@ -124,7 +124,7 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        temporary.touch()  # its error is clearer than ffmpeg's
+        temporary.touch()  # where nothing can be written, Python's error is clearer than ffmpeg's
         count = _encode(temporary, pictures, size, fps, CODING[path.suffix.lower()].split())
         os.replace(temporary, path)
     except OSError as error:
@@ -151,7 +151,7 @@ def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], f
             process = Popen([get_ffmpeg_exe(), *arguments], stdin=PIPE, stderr=messages, start_new_session=True)
         except (OSError, RuntimeError) as error:
             raise WriteError(f"ffmpeg cannot be started: {error}") from error
-        with process, contextlib.suppress(BrokenPipeError):  # its message follows
+        with process, contextlib.suppress(BrokenPipeError):  # if ffmpeg ends early, its message is read below
             assert process.stdin is not None
             with process.stdin as stream:
                 for image in pictures:

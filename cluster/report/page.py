@@ -122,7 +122,7 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
         "together": together,
         "drives": [each.packed() for each in shown],
     }
-    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # in HTML, a name with it could end the data
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # a < in a name could end the data
     page = files("cluster.report").joinpath("drive.html").read_text(encoding="utf-8")
     write_atomic(path, page.replace('type="application/json">{}<', f'type="application/json">{text}<').encode())
 

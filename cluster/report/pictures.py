@@ -23,12 +23,12 @@ _ROAD, _WALL = "#4a4e57", "#e9efe6"
 @contextlib.contextmanager
 def plain_style() -> Iterator[None]:
     """Matplotlib's defaults, whatever the user's matplotlibrc says, and names as they are: `$` begins no formula."""
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of a home that cannot be written to
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # else it warns where the home folder cannot be written to
     import matplotlib
 
     style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "text.parse_math": False}
     del style["backend"]  # takes 0.8 s to load
-    # For good: to undo it would undo what another thread, in which MLflow writes the model, has set meanwhile.
+    # Left in place: restoring Python's filters would also undo what another thread has set meanwhile.
     warnings.filterwarnings("ignore", "Glyph .* missing from font")
     with matplotlib.rc_context(style):
         yield

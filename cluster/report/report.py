@@ -17,7 +17,7 @@ from gridsim.maps.parts import is_map_file
 from gridsim.maps.scenarios import label
 from gridsim.state import DISTANCE
 
-ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
+ELITES_SHOWN = 24  # at most, beside the champion on the page; early ones mostly, as they show the learning
 
 
 def write_report(

@@ -114,7 +114,7 @@ def _sources(settings: RunSettings) -> dict[str, str]:
     return found
 
 
-@functools.cache  # so that a process may lock a folder again
+@functools.cache  # a process that has locked a folder may call this again
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
     try:

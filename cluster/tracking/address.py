@@ -28,7 +28,7 @@ _SERVERS = ("http", "https")
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
 _HOSTED = "databricks"  # a scheme of MLflow's own; others come with plug-ins
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
-_PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a gateway in front of MLflow
+_PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # a request that gateways in front of MLflow pass on, too
 _SQLITE = re.compile(r"sqlite(\+\w+)?:///(.+?)(?:\?([\w.-]+=[^/]*))?", re.IGNORECASE | re.DOTALL)
 """Driver, path and query. A path may have a question mark, too."""
 
@@ -75,7 +75,7 @@ def unreachable(uri: str) -> str:
     if scheme in _DATABASES:
         parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
         try:
-            if parts.hostname:  # else it is reached by a Unix socket
+            if parts.hostname:  # an address without a host is a Unix socket's
                 socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
         except (OSError, ValueError) as error:
             return one_line(error, uri)
@@ -169,8 +169,8 @@ def sqlite_path(uri: str) -> Path | None:
 def sqlite_uri(path: Path, query: str | None = None) -> str:
     """The SQLite address of an absolute path.
 
-    SQLAlchemy takes a question mark for a query's beginning, and decodes what follows a percent sign. MLflow makes the
-    folders of an encoded path, unless the address names the driver.
+    SQLAlchemy takes a question mark for the beginning of a query, and decodes %3F and the like; so both marks are
+    encoded. MLflow would create folders with the encoded names, unless the address also names the driver.
     """
     text = str(path).replace("%", "%25").replace("?", "%3F")
     return f"sqlite{'+pysqlite' if text != str(path) else ''}:///{text}" + (f"?{query}" if query else "")

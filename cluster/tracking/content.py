@@ -29,8 +29,8 @@ class Content:
     params: Mapping[str, str]
     tags: Mapping[str, str]
     rows: list[tuple[int, Mapping[str, float], float]] = field(default_factory=list)  # step, metrics, wall_s
-    note: str = ""  # how the description begins, Markdown
-    result: str = ""  # what the description has besides at the end; `{run_id}` stands for MLflow's id of the run
+    note: str = ""  # beginning of the run's description, Markdown
+    result: str = ""  # appended to the description when the run ends; `{run_id}` becomes MLflow's id of the run
     files: list[Path] = field(default_factory=list)  # sent at the end
     model: Model | None = None  # sent at the end
     finished: bool = False  # a finished run's status, end and files in MLflow stay as they are

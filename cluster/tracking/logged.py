@@ -75,7 +75,7 @@ class LoggedRun:
         error = None
         try:
             link = {} if self.run_id else self._identify(content)
-            if problem := unreachable(self._uri):  # for which MLflow would wait longer
+            if problem := unreachable(self._uri):  # asked first, because MLflow itself would wait for longer
                 return problem
             if link:
                 self._open(content, link)
@@ -134,7 +134,7 @@ class LoggedRun:
         client.log_batch(info.run_id, params=params, tags=[RunTag(*tag) for tag in new.items()])
         for name in data.metrics:
             self._steps[name] = {metric.step for metric in client.get_metric_history(info.run_id, name)}
-        if content.finished and info.status == "FINISHED" and not self._missing_rows(content):  # it stays as it is
+        if content.finished and info.status == "FINISHED" and not self._missing_rows(content):  # it is complete there
             self._status = "FINISHED"
             stored = [*client.list_artifacts(info.run_id), *client.list_artifacts(info.run_id, MODEL)]
             sizes = {path.name: path.stat().st_size for path in content.files}
@@ -159,7 +159,7 @@ class LoggedRun:
         if experiment is None or experiment.lifecycle_stage != "active":
             problem = "has been deleted; restore it" if experiment else "cannot be created; create it"
             raise TrackingError(f"experiment {experiment_name!r} {problem} or choose another name")
-        if VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
+        if VIEW_TAG not in experiment.tags:  # one that is there may be the user's own, changed in the UI
             with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
                 client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, _view())
         # mlflow.user, mlflow.source.*, and the parent of a comparison's run (MLFLOW_RUN_CONTEXT)
@@ -217,7 +217,7 @@ class LoggedRun:
         try:
             self._client.log_artifact(self.run_id, str(path), folder)
         except OSError as error:
-            if not error.filename:  # of a server
+            if not error.filename:  # a server's error, not one of a file here
                 raise
             raise TrackingError(f"{error.filename2 or error.filename}: {error.strerror}") from error
         self._artifacts.add(f"{folder}/{path.name}" if folder else path.name)
@@ -252,7 +252,7 @@ class LoggedRun:
         client, source = self._client, f"{self._location.rstrip('/')}/{MODEL}"
         own = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
         if all(each.tags.get(CHAMPION_TAG) != model.tags[CHAMPION_TAG] for each in own):
-            with contextlib.suppress(MlflowException):  # it may exist
+            with contextlib.suppress(MlflowException):  # raised if the name exists already
                 client.create_registered_model(model.name, description=model.about)
             tags = dict(model.tags)
             client.create_model_version(model.name, source, self.run_id, tags, None, model.note, await_creation_for=0)

@@ -40,7 +40,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         at_eof: is called in a thread when `orders` ends, as it does when the run's process has ended.
     """
     order, ends = json.loads(orders.readline()), SimpleQueue[Status]()
-    sys.argv[:] = order["argv"]  # of which MLflow keeps the command
+    sys.argv[:] = order["argv"]  # MLflow records these as the run's command
 
     def listen() -> None:
         for line in orders:
@@ -67,7 +67,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         try:
             content = read(folder)
             lacking = run.lacking(content, status) if content else []
-        except Exception as failure:  # of a damaged folder; the run goes on
+        except Exception as failure:  # the folder is damaged; the run goes on
             content, lacking, error = None, ["what is new in its folder"], one_line(failure)
         if content and (lacking or not run.run_id):
             tell()

@@ -85,7 +85,7 @@ class Tracking:
             self.listen()
         timeout_s = CLOSE_S if status == "FINISHED" else STOP_S
         nothing = False
-        with contextlib.suppress(Exception):  # of a damaged folder, about which the process tells
+        with contextlib.suppress(Exception):  # the folder is damaged, which the process reports
             nothing = self._read(self._folder) is None
         if not nothing:
             self._tell(status)
@@ -111,7 +111,7 @@ class Tracking:
     def _tell(self, message: Any) -> None:
         assert self._process
         assert self._process.stdin
-        with contextlib.suppress(OSError, ValueError):  # it has ended, which `_listen` notices
+        with contextlib.suppress(OSError, ValueError):  # the process has ended, which `_listen` notices
             print(json.dumps(message), file=self._process.stdin, flush=True)
 
     def _listen(self, process: Popen[str]) -> None:
@@ -123,7 +123,7 @@ class Tracking:
                 known = json.loads(line)
                 self.sent, self.error, self._lacking = known["sent"], known["error"], known["lacking"]
                 self._experiment_id, self.run_id = known["experiment_id"], known["run_id"]
-        with contextlib.suppress(OSError):  # of a status that was not read
+        with contextlib.suppress(OSError):  # the process ended before it read the status
             process.stdin.close()
         if code := process.wait():
             self._lacking = self._lacking or ["what is new"]

@@ -9,13 +9,14 @@ import warnings
 from cluster.redaction import redacted
 from cluster.workers.pool import PoolError
 
-CONNECT_S = 3.0  # for a first answer
+CONNECT_S = 3.0  # at most, until something answers at an address
 
 
 def cluster_address(given: str) -> str | None:
     """The Ray cluster meant by --address, else by RAY_ADDRESS: `host:port` or `auto`; None for a Ray of our own.
 
-    Raises PoolError as `check_address`. Where Ray takes jobs (http://..., as its guide sets RAY_ADDRESS) is no address.
+    Ray's guide sets RAY_ADDRESS to http://..., where Ray takes jobs: that is no cluster to join, and is left out with a
+    warning. Raises PoolError as `check_address`.
     """
     usual = os.environ.get("RAY_ADDRESS", "")
     if usual == "" or given not in ("", "auto"):
@@ -31,7 +32,7 @@ def cluster_address(given: str) -> str | None:
 
 
 def check_address(address: str) -> str:
-    """An address, `host:port` or `auto`. Raises PoolError within seconds if it is none or nothing answers there."""
+    """The address itself. Raises PoolError, within seconds, if it is not `host:port` or `auto`, or nothing answers."""
     host, _, port = address.rpartition(":")
     if address != "auto" and (not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address):
         raise PoolError(f"{redacted(address)!r} is not a Ray address; give host:port (of `ray start --head`) or auto")

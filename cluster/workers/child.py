@@ -9,11 +9,11 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-# Seconds from SIGTERM to SIGKILL. A run saves and ends in half of that. Ray's head never ends if it waits, in vain, for
-# its own processes.
+# Seconds from SIGTERM to SIGKILL. A run saves and ends in half of that; Ray's head may wait for ever for processes of
+# its own that do not end.
 GRACE_S = 60
-# This shell becomes the command. The one that it starts ends that, and all in its session, when a pipe ends which only
-# we hold open: if we close it, and also if we are killed.
+# This shell starts a second one and then becomes the command. The second shell reads from a pipe that only our process
+# holds open. When the pipe ends, because we close it or are killed, it ends the command and all in its session.
 _SHELL = """exec 3<&0; grace_s=$1; shift
 (read _ <&3; kill -TERM $$
 for _ in $(seq $grace_s); do sleep 1; kill -0 $$ || break; done
@@ -32,11 +32,11 @@ class Child:
             )  # fmt: skip
 
     def exit_code(self) -> int | None:
-        """None while it runs."""
+        """The command's exit code; None while it runs."""
         return self._process.poll()
 
     def is_whole(self) -> bool:
-        """Whether it runs, and so do the processes that it has started; of these only Linux tells at once."""
+        """Whether the command and the processes that it started all run; the latter are seen on Linux alone."""
         pid = self._process.pid
         with contextlib.suppress(OSError):
             for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
@@ -50,7 +50,7 @@ class Child:
         self._process.stdin.close()
 
     def close(self, patience_s: float | None) -> None:
-        """End it; after `patience_s`, None is any time, kill what is left in its session. May be called again."""
+        """End the command; after `patience_s` (None: never) kill what is left in its session. May be called again."""
         self.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)

@@ -21,7 +21,7 @@ def cores(root: Path = Path("/")) -> int:
             folder, files = root / "sys/fs/cgroup", ["cpu.max"]
             if controllers:  # version 1
                 folder, files = folder / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
-            # Those of all groups above count. In a container the path may be the host's, of which only the top is seen.
+            # Quotas of the groups above count, too. In a container the path may be the host's, whose groups it lacks.
             for name in (".", *path.split("/")):
                 folder /= name
                 with contextlib.suppress(OSError, ValueError):  # no such group; "max", no quota

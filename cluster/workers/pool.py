@@ -41,10 +41,10 @@ def size(chunk: Chunk) -> int:
 
 
 class Call(ABC):
-    """What is asked of a pool, and after that what came back."""
+    """What a pool is asked to do, and, as it comes in, the result."""
 
     noun: ClassVar[str]
-    axis: ClassVar[int]  # whether rows or columns are what the noun says
+    axis: ClassVar[int]  # of a chunk, along which the noun is counted: 0 rows, 1 columns
 
     def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk] | None, rows: int):
         columns = len(task.episodes)
@@ -70,7 +70,7 @@ class Call(ABC):
         self.busy_s[worker] += seconds
 
     def span(self, piece: Chunk) -> str:
-        """A piece in words."""
+        """Which members or episodes a piece holds, in words."""
         return f"{self.noun} {piece[self.axis].start} to {piece[self.axis].stop - 1}"
 
     @abstractmethod
@@ -117,7 +117,7 @@ class Collected(Call):
 
     def __init__(self, task: CollectTask):
         super().__init__(task, np.zeros(0, RECIPE), None, 1)
-        self._parts: dict[int, Experience] = {}  # by their first episodes
+        self._parts: dict[int, Experience] = {}  # experience of each piece, by the index of its first episode
 
     @cached_property
     def experience(self) -> Experience:

@@ -25,12 +25,12 @@ from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a worker on this machine, and on a cluster, which may be growing
+PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # with workers on this machine; on a cluster, which may still be growing
 MAX_KILLS = 3  # workers that a piece may cost
-MAX_DEATHS = 8  # of workers in a row, without an answer in between; three times as many as there are, if that is more
+MAX_DEATHS = 8  # workers that may die in a row without an answer in between, or 3 times their number if that is more
 QUEUED = 2  # pieces that a worker is sent, so that it need not wait for the next one
 LEAST_M, MOST_M = 5_000.0, 40_000.0  # metres in a piece; the largest networks take 1 ms for each, so less than patience
-MANY_M = 400.0  # metres in the smallest piece for each worker: while one computes, all others get their pieces
+MANY_M = 400.0  # for each worker in a smallest piece, which so takes as long as sending all others theirs
 
 
 class Actor:
@@ -43,11 +43,11 @@ class Actor:
         self._maps: dict[tuple[str, int], Map] = {}  # by scenario and seed
 
     def ready(self) -> int:
-        """The process's id."""
+        """The process's id, as the sign that it is up."""
         return os.getpid()
 
     def run(self, shared: list[Any], recipes: bytes, columns: slice) -> bytes:
-        """What `Worker.answer` returns for a piece of the task that `shared` refers to; Ray is slower with arrays."""
+        """What `Worker.answer` returns for a piece of the task that `shared` names, in bytes (faster than arrays)."""
         if shared != self._shared:
             import ray
 
@@ -172,7 +172,7 @@ class RayPool(WorkerPool):
         """Replace a worker, and have what it held done by another one."""
         at_it = worker.sent[0][1]  # the piece that it was at; the others it had not begun
         self._pieces.extendleft(piece for _, piece in reversed(worker.sent) if piece and piece.call is self._call)
-        self._ray.kill(worker.actor)  # it may be alive and merely out of reach
+        self._ray.kill(worker.actor)  # a worker that is out of reach may still be alive
         self._workers[self._workers.index(worker)] = self._begin()
         self._deaths += 1
         if self._call:

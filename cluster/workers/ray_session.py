@@ -35,7 +35,7 @@ CLUSTER_ENVIRONMENT = {  # added where an address is given: what answers there m
     "RAY_gcs_server_port_wait_time_s": "1",
 }
 OWN_ENVIRONMENT = {  # added for a Ray of our own, which lets in whoever has its token
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # on loopback, as Ray is by itself on these
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # listens on loopback alone, as Ray does by itself on Windows and macOS
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
@@ -55,7 +55,7 @@ MEANINGS = {  # what Ray's errors mean, by what their long texts contain
     "Version mismatch": "it has another version of Ray or Python",
 }
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
-ENDING_S = 10.0  # for Ray's processes to end
+ENDING_S = 10.0  # that Ray's processes get to end by themselves
 _has_token = False  # whether Ray, which reads its variables when it is imported, has those of OWN_ENVIRONMENT
 
 
@@ -78,7 +78,7 @@ class Session:
         _has_token = _has_token or address is None
         wanted = ENVIRONMENT | (OWN_ENVIRONMENT if address is None else CLUSTER_ENVIRONMENT)
         new = wanted.keys() - os.environ.keys()
-        os.environ.update({name: wanted[name] for name in new})  # before there are threads, which may be reading it
+        os.environ.update({name: wanted[name] for name in new})  # threads that start later may read it at any time
         try:
             return self._join(address or self._start(cpus, patience_s))
         finally:
@@ -138,7 +138,7 @@ class Session:
     def check(self) -> None:
         """Raise PoolError if a process of our own Ray has ended: calls to Ray would then hang, or end this process."""
         if self._head and not self._head.is_whole():
-            logs, self._folder = f"{self._folder}/r/session_latest/logs", ""  # which are kept
+            logs, self._folder = f"{self._folder}/r/session_latest/logs", ""  # the logs are kept
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 
     def close(self) -> None:

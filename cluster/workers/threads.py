@@ -13,8 +13,8 @@ from cluster.workers.pool import BuildMap, Call, Chunk, PoolError, WorkerPool, c
 from cluster.workers.worker import Worker
 from gridsim.maps.map import Map
 
-# Metres in a piece. The largest takes a small network some 20 ms. Then a thread needs Python's lock, and may wait 5 ms
-# for it if another one is busy with Python (an import, a save): with pieces of 2 ms a second thread gained nothing.
+# Metres in a piece. The largest piece takes a small network some 20 ms. After each piece a thread needs Python's lock,
+# and waits up to 5 ms for it while another thread runs Python: with pieces of 2 ms a second thread gained nothing.
 LEAST_M, MOST_M = 5_000.0, 20_000.0
 
 Answer = tuple[Call, int, Chunk, tuple[Any, ...] | Exception]

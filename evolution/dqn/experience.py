@@ -26,7 +26,7 @@ from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 from gridsim.sensing.observation import SPEED_SCALE
 
-NO_ACTION = 255  # of an episode's last row
+NO_ACTION = 255  # the action in an episode's last row, which has none
 UNITS = F(4096.0)  # fixed-point units per 1
 _AREA = CELLS * CELLS
 _FRAME = _AREA // 4  # bytes

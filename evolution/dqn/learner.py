@@ -34,8 +34,8 @@ from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS
 
 T = TypeVar("T", np.ndarray, float)
-RANDOM_SHARE = 0.02  # of exploration's decline, over which it falls from random driving
-SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
+RANDOM_SHARE = 0.02  # share of --anneal in which exploration falls from 1 to each episode's own share
+SPREAD = 7.0  # exploration ranges from epsilon to epsilon ** (1 + SPREAD) (alpha of Horgan et al. 2018)
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
 _adam = partial(adam, fused=True, amsgrad=False, beta1=0.9, beta2=0.999, weight_decay=0.0, maximize=False)
@@ -47,7 +47,7 @@ class DqnConfig:
 
     batch: int = 256  # transitions of an update
     learning_rate: float = 1e-3  # Adam's, at the beginning
-    final_learning_rate: float = 0.05  # its final value, relative to that
+    final_learning_rate: float = 0.05  # Adam's at the end, as a share of `learning_rate`
     learning_rate_updates: int = 50_000  # over which it falls linearly
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target
@@ -64,9 +64,10 @@ class DqnConfig:
 
 
 def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
-    """Shares of random actions in a batch's episodes, declining from 1: float32 [episodes].
+    """Shares of random actions in a batch's episodes, which decline from 1 to an own share each: float32 [episodes].
 
-    Args: epsilon, the first episode's final share, the others' are smaller; progress, car-steps relative to --anneal.
+    Args: epsilon, the own share of the first episode (those of later ones are smaller); progress, car-steps so far as a
+    share of --anneal.
     """
     usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
     random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)

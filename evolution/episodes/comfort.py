@@ -1,4 +1,4 @@
-"""How smoothly and how far from others a car drives, summed up while it does; only where that is asked for."""
+"""Figures of comfort: how smoothly a car drives and how far from others. Summed up during an episode, if asked for."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ NOTES = 10
 
 @leaf
 def begin(car, notes):
-    """Begin an episode's notes."""
+    """Fill an episode's notes, float32 [NOTES], at its start."""
     notes[:] = ZERO
     notes[_COS], notes[_SIN], notes[_SPEED], notes[_GAP] = car[COS], car[SIN], car[SPEED], F(math.inf)
 
 
 @leaf
 def note(constants, road, car, world, steps, notes):
-    """Add a step, of which `steps` were driven before. Accelerations are those of the motion, whatever the model."""
+    """Add a control step to the notes, before which `steps` were driven. Accelerations are those of the motion."""
     per_s = ONE / constants.dt
     turned = math.atan2(
         notes[_COS] * car[SIN] - notes[_SIN] * car[COS], notes[_COS] * car[COS] + notes[_SIN] * car[SIN]

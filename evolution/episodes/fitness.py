@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-LINEAR_SHARE = 0.4  # of the value; without it, a slow last kilometre would cost almost nothing
+LINEAR_SHARE = 0.4  # of the score is linear in the distance; on a log scale alone, the last km counts almost nothing
 PACED_SHARE = 0.7  # weight of the paced distance in the scalar; the rest is for the distance
-PACED_ENOUGH = 0.8  # share of the distance which, if paced, counts as all: braking for other cars costs nothing
+PACED_ENOUGH = 0.8  # if this share of the distance is paced, all of it counts: braking for others costs nothing
 
 
 def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:

@@ -91,7 +91,7 @@ class Workspace(NamedTuple):
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
-    history: History | None  # with delays
+    history: History | None  # None without delays of readings and commands
     command: np.ndarray | None  # float32 [2], pedal and wheel, of a policy that has these in place of actions
 
 
@@ -144,7 +144,7 @@ def packed_genome(genome, layers, grid_buffers):
 class Recorder(NamedTuple):
     """Where an episode's experience is written, and its exploration."""
 
-    experience: Experience  # of at least as many rows as the episode has steps, and one more
+    experience: Experience  # room for a row more than the episode's time limit in steps
     epsilon: np.float32  # share of random actions, which are uniform over all actions
     key: np.uint64  # seed of the episode's random numbers
 
@@ -236,7 +236,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
     if notes is not None:
         comfort.begin(car, notes)
     if keep > 0:
-        _keep(workspace, car, world, 0)  # of an episode without a step, whose first output is NaN
+        _keep(workspace, car, world, 0)  # for an episode that ends before its first step, as an output is NaN
     while True:
         if recorder is None and end != 0:
             break
@@ -384,7 +384,7 @@ def collect(
     results = np.zeros(len(episodes), dtype=RESULT)
     # Room for episodes of any length.
     experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
-    together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # those with one simulation
+    together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # episodes that share a simulation
     for group in np.unique(together):
         which = np.flatnonzero(together == group)
         m = int(episodes["map"][which[0]])

@@ -129,7 +129,7 @@ def forward(genome, layers, speed, scratch):
 
 @leaf
 def decide(genome, layers, speed, scratch, command):
-    """The action (`policy.choose`)."""
+    """The network's action for the frames and the speed, as `policy.choose` returns it."""
     forward(genome, layers, speed, scratch)
     return choose(scratch.outputs, 0, scratch.outputs.shape[0], command)
 

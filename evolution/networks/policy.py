@@ -25,7 +25,7 @@ from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 RAYS = SensorConfig.rays
 ACTIONS = 8
 MAX_GENES = 1_000_000
-COMMAND_SCALE = 0.5  # of the genes of the layer of pedal and wheel; with 1 both would mostly be at their limits
+COMMAND_SCALE = 0.5  # scale of the genes that lead to pedal and wheel; with 1 both are at their limits mostly
 
 _FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # of a specification
 
@@ -42,7 +42,7 @@ class PolicySpec(ABC):
 
     hidden: tuple[int, ...]  # units, or channels, of the hidden layers
     actions: Actions = field(default="discrete", kw_only=True)
-    features: tuple[str, ...] = field(default=(), kw_only=True)  # also seen: of `observation.OPTIONAL`, in that order
+    features: tuple[str, ...] = field(default=(), kw_only=True)  # optional ones that it sees, in the order of OPTIONAL
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
@@ -76,12 +76,12 @@ class PolicySpec(ABC):
 
     @property
     def outputs(self) -> int:
-        """One for each action, of which the largest is chosen; or pedal and wheel."""
+        """Number of outputs: one for each action, of which the largest is chosen, or two, pedal and wheel."""
         return ACTIONS if self.actions == "discrete" else 2
 
     @property
     def suffix(self) -> str:
-        """The end of its text."""
+        """What the specification's text ends with: CONTINUOUS, or nothing."""
         return "" if self.actions == "discrete" else CONTINUOUS
 
     @property
@@ -100,7 +100,7 @@ class PolicySpec(ABC):
 
     @property
     def size(self) -> int:
-        """Genes of a genome."""
+        """Number of genes of a genome."""
         return sum((n + 1) * m for n, m in self.shapes())
 
 
@@ -134,7 +134,7 @@ KERNEL_1, STRIDE_1 = 8, 4
 KERNEL_2, STRIDE_2 = 4, 2
 SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
 SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
-UNIT_MULTIPLE = 8  # of which channels and units are multiples, so that layers are whole vectors
+UNIT_MULTIPLE = 8  # channels and units are multiples of this, so that layers are whole vectors
 
 
 @dataclass(frozen=True)
@@ -307,9 +307,10 @@ def greatest(values, first, n):
 
 @leaf
 def choose(outputs, first, n, command):
-    """What the n outputs from number `first` on say: the index of the largest one; -1 if one is NaN.
+    """The action that the n outputs from index `first` on stand for: the index of the largest; -1 if one is NaN.
 
-    With a command, float32 [2], they are two: pedal and wheel, each within [-1, 1], are written there, and not -1 is 0.
+    With a command, float32 [2], there are two outputs, pedal and wheel. They are written there, each within [-1, 1];
+    the return value is then 0, or -1 if one is NaN.
     """
     if command is None:
         return greatest(outputs, first, n)
@@ -319,7 +320,7 @@ def choose(outputs, first, n, command):
 
 @leaf
 def decide(packed, layers, scratch, command):
-    """The action of a perceptron (`choose`)."""
+    """The action of a perceptron whose inputs are in `scratch`, as `choose` returns it."""
     return choose(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1], command)
 
 

@@ -18,13 +18,13 @@ Parameters = type(None)  # a vehicle's constants are enough
 
 
 def parameters(vehicle: Any) -> None:
-    """Those of a vehicle."""
+    """A vehicle's parameters of this model: none."""
 
 
 @leaf
 def path_curvature(constants, speed, steering):
     """Curvature (1/m, left positive) of the centre of mass's path: the bicycle model's, limited by lateral grip."""
-    tangent = constants.rear_share * math.tan(steering)  # of the slip angle
+    tangent = constants.rear_share * math.tan(steering)  # tangent of the slip angle
     curvature = tangent / (math.sqrt(ONE + tangent * tangent) * constants.rear_axle)
     bound = constants.grip / max(speed * speed, F(1e-6))
     return min(max(curvature, -bound), bound)

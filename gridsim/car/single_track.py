@@ -48,7 +48,7 @@ class Parameters(NamedTuple):
 
 
 def parameters(vehicle: Any) -> Parameters:
-    """Those of a vehicle."""
+    """A vehicle's parameters of this model."""
     yaw_share = vehicle.mass / vehicle.yaw_inertia
     return Parameters(*map(F, (vehicle.mass_height, yaw_share, vehicle.cornering_stiffness, vehicle.friction)))
 

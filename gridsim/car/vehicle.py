@@ -24,7 +24,7 @@ class Action(IntEnum):
     REVERSE = 7
 
 
-NEUTRAL = F(Action.NONE)  # what a car does before the first command that comes late
+NEUTRAL = F(Action.NONE)  # what a car with late commands does until the first one arrives
 
 
 @leaf

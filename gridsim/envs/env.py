@@ -74,7 +74,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         "render_fps": 1.0 / SimConfig().episode.control_period,  # a picture per control step: real time
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _window: Window | None = None  # of the class: Gymnasium before 1.3 also closes what a wrong argument left half made
+    _window: Window | None = None  # here, as Gymnasium before 1.3 also closes environments whose __init__ failed
 
     def __init__(
         self,

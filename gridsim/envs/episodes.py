@@ -56,7 +56,7 @@ class Episodes:
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
         if not given and is_map_file(scenario):
-            self._map(self._seeds[0])  # so that a file that cannot be read is told at once
+            self._map(self._seeds[0])  # raises at once if a map's file cannot be read
         if len(set(self._seeds)) < len(self._seeds):
             raise ValueError("maps that are given need different seeds, by which episodes name them")
         self.keys = np.zeros(cars, dtype=np.uint64)

@@ -20,15 +20,15 @@ DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # the largest clearance that the fiel
 MARGIN = 0.3  # free around a car, where we choose its place
 FAR = 30.0  # least extent of a road, and how far a car can drive on from a start where all road is a dead end
 
-_CORNERS_TOO = np.ones((3, 3))  # of a node's neighbours
+_CORNERS_TOO = np.ones((3, 3))  # a node's neighbours include those across its corners
 _LEAST_DRAWING = 0.05  # share of the road that a drawing encloses, at least
 
 _SIDE = 2  # nodes, of the cells at which dead ends are looked for
-_MOST_CELLS = 1 << 19  # of road; where there are more, there is too little memory to look for dead ends
+_MOST_CELLS = 1 << 19  # of road; to look for dead ends among more would take too much memory
 _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
 _STRIDE = 1.5  # between two places of an arc that must be free, at most: no wall fits between them
-_SLACK = 0.5  # of road that stays beside where a car fits, as cells are coarse: edges of a road stay as they are drawn
+_SLACK = 0.5  # of road kept beside the places where a car fits: cells are coarse, and edges stay as they are drawn
 # Free on both sides of a car, and the radius of its bends as a multiple of its tightest.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 

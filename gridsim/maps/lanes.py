@@ -19,7 +19,7 @@ from gridsim.jit import freeze, njit
 from gridsim.maps.network import Network
 from gridsim.maps.roads import THICK_WALL, Strips
 
-Plan = tuple[Strips, Network]  # of a map: its drivable area and its lanes
+Plan = tuple[Strips, Network]  # a map's drivable area and its lanes
 
 
 class Scenario(NamedTuple):
@@ -121,7 +121,7 @@ def _sample_pieces(starts, pieces, piece_offsets, steps, offsets):
 
 
 def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`_sample_pieces` of paths."""
+    """Points of paths, as `_sample_pieces` computes them."""
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(-1, 3)
     pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
     return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)

@@ -19,7 +19,7 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, THICK_WALL, Road, St
 class Map:
     """One map; equal to itself alone."""
 
-    name: str  # its scenario's, or a file's path
+    name: str  # the scenario's name, or the file's path
     seed: int  # from which it was built
     road: Road
     strips: Strips  # the exact drivable area, for pictures and tests
@@ -65,7 +65,7 @@ class Map:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its arrays."""
+        """Memory that the map's arrays take, in bytes."""
         return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts, self.begins))
 
     def __getstate__(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ class Network(NamedTuple):
     # int32 [lanes, k], padded with -1, at least one: lanes that start at its end point, modulo the torus's sides
     successors: np.ndarray
     left: np.ndarray  # int32 [lanes], lane to which a car may change, or -1; its point i is beside point i
-    right: np.ndarray  # as `left`
+    right: np.ndarray  # the same for the lane to the right
     crossing_offsets: np.ndarray  # int32 [lanes + 1], where each lane's part of `crossings` begins
     # int32 [c], for each lane the lanes with which it conflicts in a junction: they cross it or merge into its end.
     # Lanes with the same beginning, predecessors, successors and neighbours are not among them.

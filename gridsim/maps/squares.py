@@ -63,7 +63,7 @@ class Layout:
         self.paths: list[Path] = []
 
     def line(self, x: float, y: float, end_x: float, end_y: float) -> None:
-        """A straight road."""
+        """Add a straight road between two points."""
         self.lines.append([x, y, end_x, end_y, self.half_road])
 
     def join(self, x: float, y: float, half: float, arms: list[int]) -> None:

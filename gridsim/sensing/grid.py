@@ -1,10 +1,9 @@
 """The occupancy grid: the ground ahead, cell by cell, computed from the range sensor's rays.
 
-80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side; for small cars of half a unit
-(`SimConfig.unit`). Row 0 is the farthest ahead and
-column 0 the leftmost, as in a picture that looks ahead. Each cell within the field of view belongs to the ray whose
-direction is nearest to its centre's. With r the centre's distance from the front axle, R the ray's range and h half the
-diagonal of a cell, the cell is
+80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side (for small cars these are units,
+`SimConfig.unit`). Row 0 is the farthest ahead and column 0 the leftmost, as in a picture that looks ahead. Each cell
+within the field of view belongs to the ray whose direction is nearest to its centre's. With r the centre's distance
+from the front axle, R the ray's range and h half the diagonal of a cell, the cell is
 
 * free if r < R - h, before the ray's hit;
 * occupied if R - h <= r <= R + h, at the hit;

@@ -20,11 +20,11 @@ _SIDES = F(math.sqrt(3.0) / 1024.0)  # scales the sum of four whole numbers belo
 
 
 class Imperfections(NamedTuple):
-    """Of the range sensor, as kernels read them."""
+    """Imperfections of the range sensor, as kernels read them."""
 
     noise: np.float32  # m, standard deviation
     noise_share: np.float32  # the same, as a share of the range
-    dropout: np.uint64  # of 2 ** 24 readings, those that are the sensor's full range
+    dropout: np.uint64  # how many of 2 ** 24 readings are the sensor's full range, whatever is there
 
 
 class Delays(NamedTuple):

@@ -25,15 +25,15 @@ class Feature(NamedTuple):
     """A part of an observation: values in SI units, or shares."""
 
     name: str
-    values: int
-    full: np.float32  # what the environment returns as 1
-    unit: np.float32  # what networks read as 1, without the shift
-    near: bool = False  # networks resolve small values best: they read v as 2 v / (v + unit) - 1
-    least: np.float32 = -ONE  # what the environment returns, at least
+    values: int  # how many numbers it has
+    full: np.float32  # the value that the environment returns as 1
+    unit: np.float32  # the value that networks read as 1, before the shift
+    near: bool = False  # networks read a value v as 2 v / (v + unit) - 1, which resolves small values best
+    least: np.float32 = -ONE  # the smallest number that the environment returns
     shift: float = 0.0  # added to what networks read
-    mirror: float = 1.0  # factor of the values in a mirror
-    reversed: bool = True  # whether their order is reversed in a mirror
-    sees: str = ""  # what a network sees that names it, as in `mlp:64+steering`; "": all networks see it
+    mirror: float = 1.0  # factor of the values in a mirrored world
+    reversed: bool = True  # whether the values have the opposite order in a mirrored world
+    sees: str = ""  # for help: what a network sees that names this, as in `mlp:64+steering`; "": all networks see it
 
 
 def features(k: Constants) -> tuple[Feature, ...]:

@@ -25,7 +25,7 @@ _STRETCH = F(1.5)  # length of a step above it, in clearances
 _CLOSE = F(0.04)  # clearance at which a ray has arrived
 _SLOPE_MIN = F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
 LEAP = F(2.0)  # added to a stretched step; still shorter than any wall of 3 or more
-MARGIN = F(0.1)  # of safety: among thin walls, unseen gaps are at most the walls' thickness less this
+MARGIN = F(0.1)  # for safety: what a ray leaves unseen among thin walls is shorter by this than they are thick
 
 
 def vector_march(steps: int, look_back: bool) -> Any:

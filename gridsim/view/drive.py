@@ -27,7 +27,7 @@ from gridsim.view.render import Renderer, Window, interpolate
 # The columns of a recorded drive: the time is since the episode's start, and a restart begins the next episode.
 _POSE = ("x_m", "y_m", "heading_rad", "speed_mps", "steering_rad")
 COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed", "sim")
-MAX_TRAFFIC = 1000  # of a drive that is read
+MAX_TRAFFIC = 1000  # other cars in a recorded drive that is read
 LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes

@@ -15,7 +15,7 @@ from gridsim.jit import F, njit
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, Road, clearance, node_clearance, pack_field
 
 GROUND = (226, 231, 218)
-GROUND_OTHER = (220, 226, 211)  # of every other square, so that motion is visible
+GROUND_OTHER = (220, 226, 211)  # colour of every other square of the ground, so that motion is visible
 VERGE = (190, 197, 178)
 ASPHALT = (66, 70, 79)
 EDGE_LINE = (236, 238, 240)

@@ -27,7 +27,7 @@ from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
-METRES = 52.0  # height of a picture, like all lengths here in units (`SimConfig.unit`), which are m but for small cars
+METRES = 52.0  # height of a picture. Lengths in this file are units (`SimConfig.unit`): metres, but for small cars
 CAR_AT = 0.74  # height of the car in a picture, as a share from the top
 
 
@@ -238,7 +238,7 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
 class Window:
     """A window on a display, with its keys. A process may have several."""
 
-    _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
+    _open: ClassVar[dict[Any, Window]] = {}  # open windows by pygame's, which events refer to
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError, and GridSimError without pygame."""
@@ -282,7 +282,7 @@ class Window:
         Names are pygame's: "up", "space", "q", "escape". Also closes the windows that a user has closed.
         """
         pygame = self._pygame
-        for event in pygame.event.get():  # of all windows
+        for event in pygame.event.get():  # pygame has one queue for all windows
             window = self._open.get(getattr(event, "window", None))
             if event.type == pygame.QUIT:
                 for each in [*self._open.values()]:

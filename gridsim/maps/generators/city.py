@@ -1,6 +1,6 @@
 """The city: narrow irregular blocks on a torus, plain crossings with tight corners, parked cars in bays at the kerb.
 
-Streets run along the axes at irregular distances. Each lacks one piece, which makes T junctions and bends. A bay
+Streets run along the axes at irregular distances. Each street lacks one piece, which makes T junctions and bends. A bay
 widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes.
 """
 
@@ -63,7 +63,7 @@ def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tup
 
 
 def city_layout(rng: np.random.Generator) -> Plan:
-    """A city."""
+    """The strips and lanes of a random city."""
     (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
     xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
     edges = street_graph(rng, columns, rows)

@@ -93,7 +93,7 @@ def _rounded(corners: np.ndarray, rng: np.random.Generator) -> Path | None:
 
 
 def curved_layout(rng: np.random.Generator) -> Plan:
-    """A loop."""
+    """The strips and lanes of a random closed road."""
     while True:
         middle = _rounded(_corners(rng), rng)
         if middle is None or sum(length for length, _ in middle.pieces) < SHORTEST_LOOP:

@@ -23,7 +23,7 @@ STRAIGHT = 20.0  # m between S-bends, at least
 
 
 def highway_layout(rng: np.random.Generator) -> Plan:
-    """A highway."""
+    """The strips and lanes of a random highway."""
     while True:
         radii = rng.uniform(*RADIUS, (BENDS, 2))
         shifts = rng.uniform(*SHIFT, BENDS) * rng.choice([-1.0, 1.0], BENDS)

@@ -35,7 +35,7 @@ def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
     layout.arcs.append([x, y, RADIUS, 0.0, 2 * math.pi, HALF_RING])
     for arm in arms:
         dx, dy = DIRECTIONS[arm]
-        inner = RADIUS - HALF_RING + HALF_ROAD + 0.25  # its round end must not cover the island
+        inner = RADIUS - HALF_RING + HALF_ROAD + 0.25  # the arm ends in a half circle, which must not cover the island
         layout.line(dx * TILE / 2 + x, dy * TILE / 2 + y, dx * inner + x, dy * inner + y)
         for side in (1.0, -1.0):  # way in, way out
             (cx, cy), first = rotated(FLARE_X, side * FLARE_Y, arm), arm * math.pi / 2 - side * math.pi / 2
@@ -43,7 +43,7 @@ def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
 
 
 def roundabout_layout(rng: np.random.Generator) -> Plan:
-    """A network in which each T and crossing is a roundabout."""
+    """The strips and lanes of a random network in which each T and crossing is a roundabout."""
     while True:
         edges = tile_graph(rng)
         if (edges.sum(axis=1) > 2).sum() >= FEWEST:

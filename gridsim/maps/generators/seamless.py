@@ -12,7 +12,7 @@ ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 
 
 def seamless_layout(rng: np.random.Generator) -> Plan:
-    """A network."""
+    """The strips and lanes of a random network."""
     return lay_tiles(rng, tile_graph(rng), ROUNDABOUT_SHARE)
 
 
