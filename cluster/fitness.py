@@ -38,7 +38,7 @@ def give(function: Fitness) -> str:
 
 
 def forget() -> None:
-    """Have functions found anew, whose files may have changed."""
+    """Forget the functions found so far, as their files may have changed."""
     load.cache_clear()
     _find.cache_clear()
 

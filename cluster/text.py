@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def count(number: int, noun: str) -> str:
-    """As in `1 row` or `2 rows`."""
+    """A number with its noun, as in `1 row` or `2 rows`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 

@@ -53,7 +53,7 @@ def _in_temporary() -> Path:
 
 def _in_private() -> Path:
     folder = tempfile.mkdtemp(prefix="gridsim-kernels-")
-    # Only this process runs it, not its forks; and commands run it, too, which skip `atexit` (`entry`).
+    # `atexit` would also run it in forks of this process, and not in commands, which skip `atexit` (`entry`).
     Finalize(None, shutil.rmtree, [folder], {"ignore_errors": True}, exitpriority=0)
     return Path(folder)
 
@@ -68,7 +68,7 @@ def _closed(folder: Path) -> Path:
                 path.mkdir(mode=0o700)
         info = path.lstat()
         writable = info.st_mode & stat.S_IWOTH or (info.st_mode & stat.S_IWGRP and not _is_own_group(info.st_gid))
-        sticky = info.st_mode & stat.S_ISVTX  # as /tmp: others can add to it, but not replace what is there
+        sticky = info.st_mode & stat.S_ISVTX  # like /tmp: others can add files, but not replace those of the user
         if not stat.S_ISDIR(info.st_mode):
             raise OSError(f"{path}: it is a link or a file")
         if info.st_uid not in (trusted if path != folder else {user}):

@@ -18,7 +18,9 @@ _OUTLINE = np.array(
     dtype=np.float32,
 )
 _OUTLINE.setflags(write=False)
-_OUTLINE_STEP = F(0.1)  # m between points of the outline beside thin walls, at least; a corner reaches in half as far
+_OUTLINE_STEP = F(
+    0.1
+)  # m between points of the outline beside thin walls, at least; a corner may reach in by half of it
 
 
 @leaf
@@ -66,9 +68,10 @@ def collides(road, constants, x, y, cosine, sine):
 
 @leaf
 def separation(constants, dx, dy, cosine, sine, other_cosine, other_sine):
-    """Gap (m) between two cars along the best of their axes, the other (dx, dy) m away; negative if they overlap.
+    """Gap (m) between two cars, the other (dx, dy) m away; negative if they overlap.
 
-    It is their distance unless their corners are closest; then it is less (Gottschalk et al. 1996).
+    It is the largest gap along any of their four axes (separating axis theorem, Gottschalk et al. 1996). If two corners
+    are closest, their distance is greater.
     """
     length, breadth = constants.half_length, constants.half_width
     along = abs(cosine * other_cosine + sine * other_sine)

@@ -160,7 +160,7 @@ class SimConfig:
     randomise: tuple[tuple[str, float, float], ...] = ()
 
     def drawn(self, start: np.ndarray) -> SimConfig:
-        """The configuration of the episode with a start float32 [5 or more]: the same start gives the same vehicle."""
+        """The configuration with the vehicle of one episode, drawn from its start float32 [5 or more]."""
         if not self.randomise:
             return self
         rng = np.random.default_rng(
@@ -211,15 +211,16 @@ class SimConfig:
 
     @cached_property
     def unit(self) -> float:
-        """The unit (m) of what is made to measure for a car: 1, and for one of less than 2.8 m 1/2, 1/4, 1/8 or 1/16.
+        """The unit in m: 1, and for cars shorter than 2.8 m 1/2, 1/4, 1/8 or 1/16.
 
-        Maps are resolved, and roads built, as finely; by Froude's law, speeds are scaled with its square root.
+        Generated roads, walls and the resolution of maps are sized in units. Speeds scale with the square root of the
+        unit (Froude's law).
         """
         return max(2.0 ** min(round(math.log2(self.vehicle.length / LENGTH)), 0), LEAST_UNIT)
 
     @property
     def pace(self) -> float:
-        """What speeds and times on a road that is scaled by `unit` are multiplied by."""
+        """Factor of speeds and times on a road that is scaled by `unit`."""
         return math.sqrt(self.unit)
 
     @property
@@ -328,8 +329,8 @@ class Constants(NamedTuple):
     courtesy: np.float32  # m
     contact: np.float32  # m between the middles of two cars, below which they may touch
     near: np.float32  # m from the car's middle, within which other cars matter to a control step
-    unit: np.float32  # m, of `SimConfig`
-    pace: np.float32  # of `SimConfig`
+    unit: np.float32  # m, `SimConfig.unit`
+    pace: np.float32  # `SimConfig.pace`
 
 
 def constants(config: SimConfig) -> Constants:

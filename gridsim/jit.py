@@ -77,7 +77,7 @@ class CacheLocator(UserProvidedCacheLocator):
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache of a kernel, without which a run goes on: damaged files and full disks only cost time."""
+    """Numba's cache of a kernel. Where it cannot be read or written, kernels are compiled anew, and a run goes on."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:

@@ -36,9 +36,11 @@ def package_folder(name: str) -> Path:
 
 
 def missing(extra: str) -> list[str]:
-    """What of an extra is not installed."""
+    """The modules of an extra that are not installed."""
     found = {module: find_spec(module) for module in _EXTRAS[extra].split()}
-    return [module for module, spec in found.items() if not (spec and spec.origin)]  # without one it is but a folder
+    return [
+        module for module, spec in found.items() if not (spec and spec.origin)
+    ]  # a spec without an origin is a mere folder
 
 
 def check_extra(extra: str) -> None:

@@ -22,7 +22,7 @@ def shown(value: object) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's bytes; not those of a pipe or device, which may have no end, or of a file that is no map by its size."""
+    """A file's bytes. Pipes and devices, which may have no end, and files too large for a map are refused."""
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise GridSimError(f"{path} is not a regular file")

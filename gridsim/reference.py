@@ -24,7 +24,7 @@ PACE = 0.9  # speed on a straight: 0 is the lower end of the scenario's speed in
 LATERAL = 3.2  # m/s2 in bends, below the grip limit
 ACCELERATION = 3.0  # m/s2
 BRAKING = 2.5  # m/s2 before bends
-WINDOW = 10.0  # units (`SimConfig.unit`) of a path over which its curvature is measured: a driver's steering is jerky
+WINDOW = 10.0  # units (`SimConfig.unit`) of a path over which curvature is averaged, as a driver's steering is jerky
 _STANDING = 1e-6  # m
 
 
@@ -121,7 +121,7 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
     """A drive and the reference's profile along its path, from poses [n, 5] at the control steps (`state.poses_of`).
 
     Left out are reversing, metres that are driven again, and standing, where steering has no effect; the first 5 m,
-    whose curvature is not known; and the end, from where the reference could not have stopped for what may come.
+    whose curvature is not known; and the last metres, where the reference might brake for what lies beyond.
 
     The reference begins with the agent's speed and ignores traffic. Its curvature is that of the driven path over 10 m:
     an agent that weaves in longer waves slows it down, so look at both errors.

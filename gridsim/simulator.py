@@ -148,7 +148,7 @@ class Simulator:
         self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without read-only arrays: their copies would be writable, and kernels would be compiled again for them."""
+        """State without read-only arrays: copies would be writable, and kernels would be compiled again for them."""
         return {**vars(self), "_physics": None, "_drawn": {}}
 
     def __len__(self) -> int:
@@ -190,7 +190,7 @@ class Simulator:
             _place_all(*batch, cars, starts, *self._arrays())
 
     def forget_maps(self) -> None:
-        """Have the next reset keep only maps on which there are cars."""
+        """Have the next reset remove maps on which there are no cars."""
         self._row_of = {}
 
     def _arrays(self) -> tuple[Any, ...]:

@@ -44,8 +44,8 @@ LANE_TIMER = 19  # control steps until its next decision on a change of lanes
 SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
 TRAFFIC_FIELDS = 21
 
-# A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). One from which a car goes on
-# along a route also has the lane and the key of that.
+# A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). If the car continues a route,
+# the start also has that route's lane and key.
 POSE, START_FIELDS = 5, 7
 
 

@@ -103,7 +103,7 @@ def visit_cell(road, x, y, cosine, sine):
 
 @leaf
 def place(simulation, start, car, visits):
-    """Put a car at the start of an episode: start float32 [5], or [7] to go on along a route (`state.START_FIELDS`)."""
+    """Put a car at the start of an episode: start float32 [5], or [7] to continue a route (`state.START_FIELDS`)."""
     road = simulation.road
     car[:] = ZERO
     car[X] = start[0] - math.floor(start[0] / road.width) * road.width

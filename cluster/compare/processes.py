@@ -1,6 +1,6 @@
 """A comparison's runs as processes of the learners' commands.
 
-Ctrl-C reaches the comparison alone, which passes it on. They save and end, too, if the comparison is killed.
+Ctrl-C reaches the comparison alone, which passes it on. If the comparison is killed, its runs save and end, too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from cluster.store.folder import RunFolder
 from cluster.workers.child import Child
 
-LOGS = "logs"  # folder of what the runs print, in the comparison's
+LOGS = "logs"  # folder, in the comparison's, of the files with what the runs print
 
 
 def flags_of(run: RunFolder, **more: object) -> list[str]:
@@ -37,7 +37,7 @@ def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str,
 
 
 def log_of(run: RunFolder) -> Path:
-    """What the latest process of a run has printed."""
+    """The file with what the latest process of a run has printed."""
     return run.path.parent / LOGS / f"{run.name}.log"
 
 
@@ -47,7 +47,7 @@ def said(run: RunFolder) -> list[tuple[str, str]]:
 
 
 def last_line(run: RunFolder) -> str:
-    """What a run's latest process has printed last, every few seconds its progress."""
+    """The last line that a run's latest process has printed: its progress, every few seconds."""
     return _read(run).rstrip("\n").rpartition("\n")[2]
 
 

@@ -41,7 +41,7 @@ class Recording:
     """A drive, state by state, from its start on."""
 
     scenario: Map
-    cars: np.ndarray  # float32 [steps + 1, FIELDS], the car's states (`gridsim.state`)
+    cars: np.ndarray  # float32 [steps + 1, CAR_FIELDS], the car's states (`gridsim.state`)
     ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how the drive ended; RUNNING if the recording was stopped first
@@ -69,7 +69,7 @@ def record(
 ) -> Recording:
     """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for `seconds`.
 
-    Args: world float32 [others, world.FIELDS], the traffic at the start.
+    Args: world float32 [others, TRAFFIC_FIELDS], the traffic at the start.
     """
     episode, spec = champion.sim.episode, PolicySpec.parse(champion.policy)
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
@@ -84,7 +84,7 @@ def record(
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:
-    """The other cars' x, y (m) and heading (cosine, sine) [steps, others, 4] of traffic [steps, others, FIELDS]."""
+    """The other cars' x, y (m) and heading (cosine, sine) [steps, others, 4] of traffic [..., TRAFFIC_FIELDS]."""
     return worlds[:, (worlds[:, :, LANE] >= 0.0).all(axis=0), :4]
 
 

@@ -39,7 +39,7 @@ COMMAND = ["pedal", "wheel"]
 
 @dataclass(frozen=True)
 class Shown:
-    """A drive on a page: the driver's name, a shorter one beside its car, and the recording.
+    """A drive on a page: the driver's name, a shorter name that is drawn beside its car, and the recording.
 
     `stride` is the number of control steps between moments of the page; rays and outputs are shown only if it is 1.
     """
@@ -61,7 +61,7 @@ class Shown:
         ]
         for k in range(boxes.shape[1]):
             channels += _place(boxes[:, k], size)
-        rays, outputs, middle = 0, list[str](), 0  # the share (%) of a bar where an output of 0 is
+        rays, outputs, middle = 0, list[str](), 0  # middle: % of a bar's length at which an output of 0 is drawn
         if self.stride == 1:
             rays = drive.ranges.shape[1]
             channels += [ray * 100.0 / float(road.unit) for ray in drive.ranges.T]
@@ -69,7 +69,7 @@ class Shown:
                 shares = drive.outputs
                 if shares.shape[1] == len(COMMAND):
                     outputs, middle = COMMAND, 50
-                    shares = 0.5 + shares * [0.5, -0.5]  # a wheel to the left is on the left
+                    shares = 0.5 + shares * [0.5, -0.5]  # a bar to the left is a wheel to the left
                 else:
                     outputs, low, high = ACTIONS, shares.min(axis=1, keepdims=True), shares.max(axis=1, keepdims=True)
                     shares = (shares - low) / np.maximum(high - low, 1e-9)

@@ -133,7 +133,7 @@ def road_map(scenario: Map, path: Path, title: str) -> None:
 
 @plain_style()
 def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> None:
-    """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
+    """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, CAR_FIELDS]."""
     from matplotlib.collections import LineCollection
 
     figure, (axis,) = figure_of(8.6, 7.6)

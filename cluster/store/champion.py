@@ -29,8 +29,8 @@ from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, seed_of_map
 from gridsim.maps.scenarios import build, default_traffic
 
-SIM_FORMAT = 2  # of a champion's `sim`; in the first one, patience and progress were per control step
-GONE = ("apart", "kerb")  # former parameters of traffic, which champions of the first format may hold
+SIM_FORMAT = 2  # of a champion's `sim`; in format 1, patience and progress were per control step
+GONE = ("apart", "kerb")  # parameters of traffic that no longer exist, in champions of the first format
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ class RunFolder:
         }
 
     def digest(self) -> str:
-        """Digest of what must not differ between a run and its resumption."""
+        """Digest of all that must be the same when a run is resumed."""
         parts = self.config()
         for name in self.settings.extendable:
             parts["settings"].pop(name)

@@ -16,7 +16,7 @@ class Model:
     name: str  # of the registered model
     about: str  # what all versions of the registered model have in common, Markdown
     note: str  # what this version is, Markdown
-    tags: Mapping[str, str]  # the version's, CHAMPION_TAG among them, and the saved model's metadata
+    tags: Mapping[str, str]  # of the version and, as metadata, of the saved model; CHAMPION_TAG is among them
     onnx: Path
     example: Mapping[str, np.ndarray]  # observations [n, ...] by the names of the graph's inputs
 

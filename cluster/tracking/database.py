@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cluster.tracking.address import TrackingError, is_database, run_table, schema_problem, sqlite_path, sqlite_uri
 
-# MLflow's own retries would go on for minutes; ours replace them.
+# MLflow's own retries would go on for minutes. `sync` tries again instead.
 _ENVIRONMENT = {
     "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
@@ -43,7 +43,7 @@ def create_database(path: Path) -> None:
     """Make a new, complete MLflow database appear at `path`, unless another process is first.
 
     MLflow builds it by 60 migrations in a second. If it is killed in the middle, or two runs start together, what is
-    left is a database that it can never open again. So it is built beside.
+    left is a database that it can never open again. So it is built in another folder and then moved.
     """
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 

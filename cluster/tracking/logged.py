@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 KEY_TAG = "gridsim.key"  # by which a run is found again
-NOTE_TAG = "mlflow.note.content"  # MLflow's for the description
-VIEW_TAG = f"mlflow.sharedViewState.{VIEW}"  # MLflow's of an experiment, for a saved view
+NOTE_TAG = "mlflow.note.content"  # MLflow's tag for the description
+VIEW_TAG = f"mlflow.sharedViewState.{VIEW}"  # MLflow's tag of an experiment for a saved view
 # What the view's run table shows of each run, and the columns' widths in pixels.
 COLUMNS = {
     "attributes.`Run Name`": 270, "metrics.`held_out/success_rate`": 165, "metrics.`validation/success_rate`": 175,
@@ -177,7 +177,7 @@ class LoggedRun:
         }
 
     def _send_rows(self, content: Content, status: Status | None) -> None:
-        """Times follow from the start, so a repeated request is the same one, which MLflow recognises."""
+        """Send missing rows. Their times follow from the start, so MLflow recognises a request that is sent again."""
         from mlflow.entities import Metric
 
         metrics = [

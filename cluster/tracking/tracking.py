@@ -2,7 +2,7 @@
 
 The folder is the queue. So MLflow may be away for as long as it likes, and never stops or slows a run: a process of its
 own (`sync.py`) sends every few seconds and a last time at the end, and what could not be sent then is sent by a later
-`sync` of the folder. MLflow takes 3 s to import, which are not the run's.
+`sync` of the folder. The 3 s that MLflow's import takes do not delay the run.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Tracking:
         self._process: Popen[str] | None = None
 
     def start(self) -> None:
-        """Start the process, without a thread. A terminal's signals do not reach it."""
+        """Start the process, but no thread yet (`listen`). A terminal's signals do not reach the process."""
         command = [sys.executable, "-P", "-m", "cluster.tracking.sync"]
         self._process = Popen(command, text=True, start_new_session=True, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         self._tell(self._order)

@@ -19,7 +19,7 @@ def cores(root: Path = Path("/")) -> int:
             if controllers and "cpu" not in controllers.split(","):
                 continue
             folder, files = root / "sys/fs/cgroup", ["cpu.max"]
-            if controllers:  # version 1
+            if controllers:  # version 1 of control groups
                 folder, files = folder / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
             # Quotas of the groups above count, too. In a container the path may be the host's, whose groups it lacks.
             for name in (".", *path.split("/")):

@@ -41,7 +41,7 @@ PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what bui
 
 
 def _marker(settings: RunSettings) -> Path:
-    """The file that marks everything that such a run needs as compiled."""
+    """The file whose existence says that all kernels are compiled which such a run needs."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
@@ -56,7 +56,7 @@ def _marker(settings: RunSettings) -> Path:
 
 
 def has_own(settings: RunSettings) -> bool:
-    """Whether a run has a fitness of its own, for which episodes' results have figures of comfort."""
+    """Whether a run has a fitness of the user's own; episodes' results then have figures of comfort."""
     return isinstance(settings, EvolveSettings) and bool(settings.fitness)
 
 

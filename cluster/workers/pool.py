@@ -91,7 +91,7 @@ class Outcome(Call):
 
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
         super().__init__(task, recipes, asked, len(recipes))
-        # States so many steps before the end as `rewind`, and the traffic then, float32 [episodes, cars, world.FIELDS].
+        # The state `rewind` steps before each episode's end, and the traffic then, [episodes, cars, TRAFFIC_FIELDS].
         self.rewound, self.worlds = np.zeros((len(task.episodes), START_FIELDS), np.float32), np.zeros_like(task.worlds)
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:

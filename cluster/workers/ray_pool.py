@@ -1,7 +1,7 @@
 """A pool of Ray actors, on a Ray of our own or on an existing cluster.
 
-Dead actors are replaced here, not by Ray's `max_restarts`, since what they held is sent again either way. So are those
-that are silent for long: of one that is stopped or cut off, Ray may never say anything.
+Dead actors are replaced here, not by Ray's `max_restarts`, since what they held is sent again either way. Actors that
+do not answer for long are replaced, too: Ray may never report one that is stopped or cut off.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ ENVIRONMENT = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
     "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job may have been submitted with files of its own
-    "RAY_CLIENT_MODE": "0",  # Ray sets this and the next one otherwise, but only when there are threads
+    "RAY_CLIENT_MODE": "0",  # Ray sets this and the next one if they are missing, when there may be threads
     "PYTHONBREAKPOINT": "ray.util.rpdb._driver_set_trace",
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # prints nothing, deaths of workers included
 }
@@ -34,7 +34,7 @@ CLUSTER_ENVIRONMENT = {  # added where an address is given: what answers there m
     "RAY_py_gcs_connect_timeout_s": "3",  # for each of three requests
     "RAY_gcs_server_port_wait_time_s": "1",
 }
-OWN_ENVIRONMENT = {  # added for a Ray of our own, which lets in whoever has its token
+OWN_ENVIRONMENT = {  # added for a Ray of our own, which admits only who has its token
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # listens on loopback alone, as Ray does by itself on Windows and macOS
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
@@ -56,7 +56,7 @@ MEANINGS = {  # what Ray's errors mean, by what their long texts contain
 }
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
 ENDING_S = 10.0  # that Ray's processes get to end by themselves
-_has_token = False  # whether Ray, which reads its variables when it is imported, has those of OWN_ENVIRONMENT
+_has_token = False  # whether OWN_ENVIRONMENT was set when Ray was imported, which is when Ray reads it
 
 
 class Session:
@@ -151,7 +151,7 @@ class Session:
             self._head.close(ENDING_S)
         self._joined, self._head, ends = False, None, time.monotonic() + ENDING_S
         while self._folder and os.path.exists(self._folder) and time.monotonic() < ends:
-            shutil.rmtree(self._folder, ignore_errors=True)  # the last ones may still write to it
+            shutil.rmtree(self._folder, ignore_errors=True)  # Ray's last processes may still write to it
 
 
 def reason(error: BaseException) -> str:

@@ -24,7 +24,7 @@ class _Common:
 
     policy: str  # as in `mlp:6,7`
     episodes: np.ndarray  # EPISODE [episodes]
-    worlds: np.ndarray  # the traffic that each begins with, float32 [episodes, cars, world.FIELDS]
+    worlds: np.ndarray  # the traffic that each begins with, float32 [episodes, cars, TRAFFIC_FIELDS]
     maps: tuple[tuple[str, int], ...]  # (scenario, seed) of each map that `episodes` indexes
     config: SimConfig
 

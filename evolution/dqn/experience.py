@@ -57,7 +57,7 @@ def empty(spec: PolicySpec, *shape: int) -> Experience:
 
 
 def join(parts: Sequence[Experience]) -> Experience:
-    """Concatenate parts, of which there are some, in their order."""
+    """Concatenate one or more parts in their order."""
     return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 

@@ -95,7 +95,7 @@ def device_of(name: str) -> torch.device:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Have PyTorch use one thread: results depend on their number, and the workers use the other cores."""
+    """Have PyTorch use one thread: results depend on the number of threads, and the workers need the other cores."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -215,7 +215,7 @@ class DqnLearner:
             tensor.copy_(torch.from_numpy(genome))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        """A copy on the device; PyTorch's memory is aligned alike in all processes, which rounding depends on."""
+        """A copy on the device. PyTorch aligns its memory alike in all processes, and rounding depends on alignment."""
         return torch.from_numpy(array).to(self.device, copy=True)
 
     def targets(self, batch: Batch) -> torch.Tensor:

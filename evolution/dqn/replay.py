@@ -1,7 +1,7 @@
 """The replay buffer: a ring of the latest rows of experience, from which transitions are drawn uniformly.
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
-action and the row after it. The value after it counts unless the step terminated the episode (`gridsim.state.End`).
+action and the row after it. The value of the latter counts unless the step terminated the episode (`state.End`).
 Rows of grids that have lost earlier frames of their stack are no longer drawn.
 """
 

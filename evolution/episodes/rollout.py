@@ -168,7 +168,7 @@ def _observed_speed(simulation, observation):
 
 @leaf
 def _record(simulation, car, workspace, grid_buffers, experience, row, gained, end):
-    """Record a row's observation, and the reward of the step that led to it, in which the car gained ground (m)."""
+    """Record a row's observation, and the reward of the step before it, in which the car `gained` m of new ground."""
     observations, actions, rewards, ends = experience
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
@@ -225,10 +225,10 @@ def _drive(simulation, setup, car, workspace, world, action):
 def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, recorder, notes, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
 
-    Notes, float32 [comfort.NOTES], are for the figures of comfort; without them, None, these are left as they are.
+    Args: notes, float32 [comfort.NOTES], sum up the figures of comfort; with None the result does not get these.
 
-    What may be None is an argument of its own: Numba prunes `is None` branches on arguments only, not on fields. If an
-    output is NaN, the episode ends as IDLE; so does the last recorded step, if any.
+    If an output of the network is NaN, the episode ends as IDLE, and so does the last step of its recording. What may
+    be None is an argument of its own, because Numba prunes `is None` branches on arguments but not on fields.
     """
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
@@ -382,7 +382,7 @@ def collect(
     traffic = freeze(worlds.copy()) if worlds.shape[1] else None
     exploration = freeze(epsilons.astype(np.float32)), freeze(keys.astype(np.uint64))
     results = np.zeros(len(episodes), dtype=RESULT)
-    # Room for episodes of any length.
+    # Each row has room for an episode of any length.
     experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
     together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # episodes that share a simulation
     for group in np.unique(together):

@@ -27,7 +27,7 @@ ACTIONS = 8
 MAX_GENES = 1_000_000
 COMMAND_SCALE = 0.5  # scale of the genes that lead to pedal and wheel; with 1 both are at their limits mostly
 
-_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # of a specification
+_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # regular expression of a specification's end
 
 Observation = Literal["rays", "grid"]
 Actions = Literal["discrete", "continuous"]

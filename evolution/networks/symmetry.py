@@ -68,7 +68,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
 
 def _inputs(spec: PolicySpec) -> list[np.ndarray]:
-    """For each layer, the index of the mirror image of each input."""
+    """For each layer an array: at each input's index that of its mirror image."""
     if isinstance(spec, CnnSpec):
         first, second, dense = spec.hidden
         return [

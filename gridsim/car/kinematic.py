@@ -32,7 +32,7 @@ def path_curvature(constants, speed, steering):
 
 @leaf
 def front_velocity(model, constants, car):
-    """The centre of mass moves at the slip angle, and the front axle turns about it."""
+    """Velocity of the front axle: the centre of mass moves at the slip angle, and the axle turns about it."""
     speed, curvature = car[SPEED], path_curvature(constants, car[SPEED], car[STEERING])
     sine_slip = curvature * constants.rear_axle
     along = speed * math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))

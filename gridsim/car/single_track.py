@@ -55,7 +55,7 @@ def parameters(vehicle: Any) -> Parameters:
 
 @leaf
 def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
-    """Move for dt seconds, within which the speed keeps its sign; the yaw rate and the slip angle are the car's.
+    """Move for dt seconds, in which the speed does not change its sign. Yaw rate and slip angle are fields of the car.
 
     The implicit midpoint rule, which is stable however stiff the tyres are at low speed.
     """
@@ -106,6 +106,6 @@ def move(model, constants, car, curvature, x, y, cosine, sine, speed, accelerati
 
 @leaf
 def front_velocity(model, constants, car):
-    """The centre of mass moves at the slip angle, and the front axle turns about it."""
+    """Velocity of the front axle: the centre of mass moves at the slip angle, and the axle turns about it."""
     along, aside = car[SPEED] * math.cos(car[SLIP]), car[SPEED] * math.sin(car[SLIP])
     return along, aside + constants.front_axle * car[YAW_RATE]

@@ -258,7 +258,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Record what cars `which` sense now, for pictures where all are; update the window. Args: begun bool [n]."""
+        """Record what cars `which` sense now, and the places of all for pictures; update the window; begun bool [n]."""
         self._observer.take(begun[which], which)
         if self.render_mode is None:
             return
@@ -313,7 +313,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
 
 def _is_seed(seed: Any) -> TypeGuard[int]:
-    """Whether it is a whole number from 0, Python's or NumPy's."""
+    """Whether a value is a whole number from 0, of Python or NumPy."""
     return isinstance(seed, Integral) and int(seed) >= 0
 
 
@@ -334,7 +334,7 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How `gymnasium.make` made it, with its time limit."""
+        """The specification by which `gymnasium.make` made this environment, with its time limit."""
         return self._spec
 
     @spec.setter

@@ -48,7 +48,7 @@ class Observer:
             stack[:, k] = stack[:, k + 1]
         stack[:, -1] = newest
         stack[begun] = newest[begun, None]
-        if not isinstance(which, slice):  # then it is a copy
+        if not isinstance(which, slice):  # indexing with an array has made a copy
             self._stack[which] = stack
 
     def look(self, which: np.ndarray | slice = _ALL) -> Seen:

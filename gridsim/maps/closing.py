@@ -18,7 +18,7 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 NODE = 1.0 / CELLS_PER_UNIT
 DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # the largest clearance that the field holds
 MARGIN = 0.3  # free around a car, where we choose its place
-FAR = 30.0  # least extent of a road, and how far a car can drive on from a start where all road is a dead end
+FAR = 30.0  # least extent of a road; where all is a dead end, a car can drive on this far from each start
 
 _CORNERS_TOO = np.ones((3, 3))  # a node's neighbours include those across its corners
 _LEAST_DRAWING = 0.05  # share of the road that a drawing encloses, at least
@@ -29,7 +29,7 @@ _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
 _STRIDE = 1.5  # between two places of an arc that must be free, at most: no wall fits between them
 _SLACK = 0.5  # of road kept beside the places where a car fits: cells are coarse, and edges stay as they are drawn
-# Free on both sides of a car, and the radius of its bends as a multiple of its tightest.
+# Room on both sides of a car, and the radius of its bends relative to its tightest one.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 
 
@@ -44,11 +44,11 @@ def _distance(region: np.ndarray) -> np.ndarray:
 
 
 def without_surroundings(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """The field of a picture with road along its border, where what surrounds the drawing is closed.
+    """Close what surrounds the drawing, in the field of a picture that has road along its border.
 
-    The surroundings are what a disc reaches from outside, so large a one that it does not slip through gaps of an
-    outline. If a drawing encloses anything, what has no wall in common with its surroundings is closed, too: the middle
-    of a race track between two lines.
+    The surroundings are what a disc can reach from outside; it is so large that it does not slip through gaps in an
+    outline. Of the regions that the drawing encloses, those that have no wall in common with the surroundings are
+    closed, too, such as the middle of a race track between two lines.
     """
     room = needed(vehicle)
     reach = math.ceil(DEEPEST / NODE) + 1
@@ -95,12 +95,13 @@ def _bends(cells: np.ndarray, radius: float) -> csr_matrix:
 def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.ndarray, np.ndarray]:
     """Close what is narrow, dead ends, and what is not joined to the rest.
 
-    What stays is where a car fits in the largest strongly connected part of its bends: from anywhere there it can drive
-    on and come back, forwards. It has easy bends with much room, or hard ones if these leave more than twice as much.
-    Where all road is a dead end, nothing is closed.
-    Returns: the field; from where a car can drive on, there or else for FAR: bool [headings, cells y, cells x].
+    What stays is the largest part of the road on which a car can drive forwards from anywhere to anywhere (strongly
+    connected). The car drives easy bends with much room beside it; if hard ones leave more than twice as much road, it
+    drives those. Where all road is a dead end, nothing is closed.
+    Returns: the field; and bool [headings, cells y, cells x], from where a car can drive on, within what stays, or if
+    nothing is closed for FAR.
     """
-    clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]  # a cell's is that of its freest node
+    clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]  # of a cell: that of its freest node
     if np.count_nonzero(clearance >= needed(vehicle)) > _MOST_CELLS:
         return nodes, np.ones((_TURNS, *clearance.shape), dtype=bool)
     tightest = math.hypot(vehicle.wheelbase / math.tan(math.radians(vehicle.steering_limit)), vehicle.rear_axle)

@@ -52,8 +52,8 @@ RESOLUTION = (0.001, 1.0)  # m a pixel
 PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
 SHORTEST_SIDE = 16  # units
 UNKNOWN = 205  # of 255, the grey of unknown pixels in maps that robots save
-ALIKE = 0.8  # `difflib.SequenceMatcher.ratio` of an unknown key and a known one from which it is a slip of the pen
-MOST_BORDER = 0.5  # share of road on a picture's border from which the road is looked for inside
+ALIKE = 0.8  # similarity (`difflib.SequenceMatcher.ratio`) above which an unknown key is a known one, misspelt
+MOST_BORDER = 0.5  # share of road on a picture's border, above which the border is taken for the surroundings
 MOST_CLOSED = 0.05  # share of the road that may be closed without a word
 
 
@@ -134,7 +134,7 @@ def _checked(path: Path, values: Any) -> MapFile:
         raise ValueError(f"starts must be a list of [x, y, heading], not {shown(starts)}")
     origin = values.get("origin", [0, 0, 0])
     if isinstance(origin, list) and len(origin) == 3 and str(origin[2]).strip("+-").lower() == "nan":
-        origin = [*origin[:2], 0]  # savers write the yaw of a flat map so
+        origin = [*origin[:2], 0]  # some programs write the yaw of a flat map as -nan
     x, y, yaw = _numbers(origin, "origin's x, y (m) and yaw (rad)", PLACE, PLACE, TURN)
     free = number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
     occupied = number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)

@@ -27,7 +27,8 @@ class Map:
     torus: bool = True  # whether leaving on one side means entering on the other
     # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
-    # bool [n], on which of a file's steps between the network's points, or starts, episodes begin; empty: on all.
+    # bool [n], of a map from a file: on which steps between the network's points, or else at which `starts`, episodes
+    # begin; empty: on all.
     begins: np.ndarray = field(default_factory=lambda: freeze(np.zeros(0, dtype=bool)))
 
     @property
@@ -82,7 +83,7 @@ class Map:
 
 
 def _frozen(part: Any) -> Any:
-    """A part of a map, its arrays read-only; they are not copied."""
+    """A part of a map with its arrays read-only, as views."""
     if isinstance(part, tuple):
         return type(part)(*map(_frozen, part))
     return freeze(part) if isinstance(part, np.ndarray) else part

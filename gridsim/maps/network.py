@@ -103,7 +103,7 @@ def _ease(offsets, steps, successors, slope, room):
 
 @njit
 def _room_at_side(points, offsets, road, hand, length, width, verge, most, room):
-    """How far (m) a car at each point can move to its side of the road, limited by that side; found by bisection."""
+    """How far (m) a car at each point can move towards the edge on its side of the road; found by bisection."""
     for lane in range(offsets.shape[0] - 1):
         first, last = offsets[lane], offsets[lane + 1] - 1
         for p in range(first, last + 1):

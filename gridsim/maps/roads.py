@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from gridsim.jit import F, freeze, leaf, njit
 
-# In units (`SimConfig.unit`), which are metres but for small cars: their roads are the same fields, of smaller metres.
+# In units (`SimConfig.unit`): metres, or less for small cars, whose roads are the same fields on a smaller scale.
 CELLS_PER_UNIT = 2  # nodes of the clearance field per unit
 FIELD_FLOOR = -2.0  # clearance of byte 0, also of places deeper inside a wall
 FIELD_STEPS = 32.0  # steps of the byte per unit; byte 255 is 5.97
@@ -37,7 +37,7 @@ class Road(NamedTuple):
     speed_high: np.float32  # m/s
     thinnest: np.float32  # units; no ray passes a wall that is at least as thick as this
     unit: np.float32  # m, a power of two
-    per_m: np.float32  # units
+    per_m: np.float32  # units in a metre
     ways: np.float32  # 2: driving back over the same ground counts as new distance; 1: it does not
 
 
@@ -50,7 +50,7 @@ class Strips(NamedTuple):
 
     @classmethod
     def of(cls, lines: ArrayLike = (), arcs: ArrayLike = (), blocks: ArrayLike = ()) -> Strips:
-        """From rows of numbers."""
+        """Strips from rows of numbers, as the attributes have them."""
         rows = ((lines, 5), (arcs, 6), (blocks, 5))
         return cls(*(freeze(np.asarray(part, dtype=np.float64).reshape(-1, width)) for part, width in rows))
 

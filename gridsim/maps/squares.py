@@ -67,9 +67,9 @@ class Layout:
         self.lines.append([x, y, end_x, end_y, self.half_road])
 
     def join(self, x: float, y: float, half: float, arms: list[int]) -> None:
-        """Roads between the middles of some sides of a square (side 2 * half) centred on (x, y)."""
+        """Add the roads that join the middles of some sides of a square (side 2 * half) centred on (x, y)."""
         if len(arms) == 3:
-            # Not needed for coverage: it fills the dip of the clearance where the other three strips meet.
+            # Adds no road, but fills the dip of the clearance where the other three strips meet.
             dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
             self.line(dx * half + x, dy * half + y, x, y)
         for a, b in combinations(arms, 2):
@@ -89,7 +89,7 @@ class Layout:
         arms: list[int],
         pieces: Callable[[int, float, float], Pieces] = through_square,
     ) -> None:
-        """Lanes from each of some sides of a square to each other one; `pieces` is called like `through_square`."""
+        """Add lanes from each of some sides of a square to each other; `pieces` is called like `through_square`."""
         for entry, exit in permutations(arms, 2):
             edge_x, edge_y = rotated(half, self.offset, entry)
             way = pieces((exit - entry) % 4, half, self.offset)

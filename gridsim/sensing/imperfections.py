@@ -35,7 +35,7 @@ class Delays(NamedTuple):
 
 
 class History(NamedTuple):
-    """What a car has seen and was told, and does not know or do yet."""
+    """Readings and commands of the latest control steps, which take effect late; rings, indexed by step."""
 
     readings: np.ndarray  # float32 [steps, 2, rays], ranges and closing speeds
     commands: np.ndarray  # float32 [steps, 2]
@@ -77,7 +77,7 @@ def new_history(delays, rays):
 
 @leaf
 def late_readings(history, car, ranges, closing):
-    """Put the readings of some steps ago in place of the latest ones; before there are any, the first ones."""
+    """Replace the latest readings by those of some steps ago, or in the first steps by the first readings."""
     if history is None or history.readings.shape[0] == 0:
         return
     steps = I(history.readings.shape[0])
@@ -96,7 +96,7 @@ def late_readings(history, car, ranges, closing):
 
 @leaf
 def late_command(history, car, first, second, neutral):
-    """The command of some steps ago, two numbers, in place of the latest one; before there is any, neutral and 0."""
+    """The command, two numbers, of some steps ago; in the first steps neutral and 0. Keeps the latest one."""
     if history is None or history.commands.shape[0] == 0:
         return first, second
     slot = I(car[STEPS]) % I(history.commands.shape[0])

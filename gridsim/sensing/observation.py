@@ -58,7 +58,7 @@ ROUTE = [feature.name for feature in FEATURES].index("route")
 class Encoding(NamedTuple):
     """How an observation is encoded, as kernels read it; arrays [features]."""
 
-    first: np.ndarray  # int64 [features + 1], where each one's values begin; it has none if it is not seen
+    first: np.ndarray  # int64 [features + 1], where each feature's values begin; one that is not seen has none
     near: np.ndarray  # bool
     full: np.ndarray  # float32, as the others
     least: np.ndarray
@@ -66,7 +66,7 @@ class Encoding(NamedTuple):
     shift: np.ndarray
 
     def each(self, numbers: Iterable[float]) -> np.ndarray:
-        """A number [features] of each value's feature: float32 [values]."""
+        """Numbers [features], repeated for each value of a feature: float32 [values]."""
         return np.repeat(np.array([*numbers], dtype=np.float32), np.diff(self.first))
 
 

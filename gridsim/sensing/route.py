@@ -21,7 +21,7 @@ from gridsim.state import COS, POSE, ROUTE_ALONG, ROUTE_KEY, ROUTE_LANE, SIN, X,
 AHEAD = (F(5.0), F(10.0), F(20.0), F(40.0))  # units along the route to the points that are seen
 ASTRAY = F(6.0)  # units from the route beyond which an episode ends
 _OPPOSITE = F(1e8)  # m2, more than any squared distance on a map
-_KEYS = U((1 << 24) - 1)  # float32 has whole numbers up to here
+_KEYS = U((1 << 24) - 1)  # float32 holds all whole numbers up to here
 
 
 def check_lanes(road_map: Map, features: tuple[str, ...]) -> None:
@@ -67,10 +67,10 @@ def _place(car):
 
 @exact
 def _beside(network, car, k):
-    """A car beside the segment from point k of the network on.
+    """Where a car is relative to the segment that begins at point k of the network.
 
-    Returns: where it is along it, as a share of its length; then the squared distance (m2) of the segment's nearest
-    point, and how much the segment leads the car's way, in m of its length.
+    Returns: the car's projection on the segment, as a share of the segment's length; the squared distance (m2) to the
+    segment; and the segment's component along the car's heading (m), below 0 if it leads the other way.
     """
     x, y = network.points[k, 0], network.points[k, 1]
     ux, uy = network.points[k + U(1), 0] - x, network.points[k + U(1), 1] - y
@@ -83,9 +83,9 @@ def _beside(network, car, k):
 
 @njit(_nrt=False, fastmath=False)
 def begin_route(network, start, car):
-    """Begin the route of a car that has been put at `start`, or go on along the one that the start names.
+    """Begin the route of a car that has been put at `start`, or continue the route that the start names.
 
-    A new one begins where the nearest lane is that leads the car's way.
+    A new route begins on the nearest lane that leads in the car's direction.
     """
     goes_on = start.shape[0] > POSE and start[POSE + 1] > ZERO
     best = F(np.inf)
@@ -110,7 +110,7 @@ def begin_route(network, start, car):
 
 @njit(_nrt=False, fastmath=False)
 def follow_route(network, car, most):
-    """Move a car's place on its route to the point next to it, `most` m at most, and not back to an earlier lane.
+    """Move a car's place on its route to the point nearest to it, by `most` m at most, not back to an earlier lane.
 
     Returns: by how much (m, negative backwards), and the car's squared distance from there (m2).
     """

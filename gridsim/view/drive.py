@@ -128,7 +128,10 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
 
 def _drive_of(reader: csv.DictReader[str]) -> Drive:
     """The drive of a file's rows. Raises: ValueError or csv.Error at the first one that does not fit."""
-    if reader.fieldnames not in ([*COLUMNS], [*COLUMNS[:-1]]):  # the latter is an earlier one's, of the default car
+    if reader.fieldnames not in (
+        [*COLUMNS],
+        [*COLUMNS[:-1]],
+    ):  # the shorter form is of earlier versions: the default car
         raise ValueError(f"the first line must be {','.join(COLUMNS)}")
     poses: list[list[float]] = []
     actions: list[int] = []

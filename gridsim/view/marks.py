@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from gridsim.jit import freeze
 from gridsim.maps.map import Map
 
-BESIDE, SLACK = 3.4, 1.2  # m between the centre lines of neighbours, and the greatest difference from it
+BESIDE, SLACK = 3.4, 1.2  # m between the centre lines of neighbours, and by how much it may differ
 PARALLEL = 0.985  # cosine of the angle within which neighbours are parallel: 10 degrees
 PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and length of a dash
 

@@ -45,8 +45,8 @@ def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
     zero, half, one = F(0.0), F(0.5), F(1.0)
     scale = F(pixels_per_m)
     line_at, line_half = F(EDGE_AT) * scale, F(EDGE_HALF) * scale
-    inner = F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge beyond which there is only asphalt
-    outer = -max(F(VERGE_WIDTH), one / scale)  # ... and only ground
+    inner = F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge: further inside there is only asphalt
+    outer = -max(F(VERGE_WIDTH), one / scale)  # m from the edge: further outside there is only ground
     for j in range(image.shape[0]):
         for i in range(image.shape[1]):
             x = F(origin[0] + i * step_x[0] + j * step_y[0])

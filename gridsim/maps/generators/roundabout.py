@@ -31,7 +31,7 @@ def _around(turn: int, half: float, _offset: float) -> Pieces:
 
 
 def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
-    """The strips of a roundabout centred on (x, y)."""
+    """Add the strips of a roundabout centred on (x, y)."""
     layout.arcs.append([x, y, RADIUS, 0.0, 2 * math.pi, HALF_RING])
     for arm in arms:
         dx, dy = DIRECTIONS[arm]
