@@ -2,12 +2,18 @@
 
 import re
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 
 
 def count(number: int, noun: str) -> str:
     """A number with its noun, as in `1 row` or `2 rows`."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def km_per_collision(figures: Mapping[str, float]) -> str:
+    """Kilometres per collision of `figures.summarise`; without a collision, which distance was driven."""
+    return f"{'' if figures['collision_rate'] else 'more than '}{figures['km_per_collision']:,.3g}"
 
 
 def file_name(words: str) -> str:

@@ -30,6 +30,7 @@ from cluster.compare.results import Run, measured, read_run
 from cluster.redaction import redacted
 from cluster.settings import IN_WORDS, check_workers
 from cluster.store.folder import RunFolder, lock, new_folder
+from cluster.text import km_per_collision
 from cluster.tracking.address import check_uri
 from cluster.tracking.tracking import Status, Tracking, saved_uri
 from cluster.workers.address import cluster_address
@@ -187,7 +188,8 @@ def _train(
                         figures = read_run(run.path).figures
                         console.print(
                             f"run {total - to_do}/{total}  {run.name}: success {figures['success_rate']:.0%}, "
-                            f"{figures['distance_m']:,.0f} m, {figures['training_s']:.0f} s  "
+                            f"{figures['distance_m']:,.0f} m, {km_per_collision(figures)} km per collision, "
+                            f"{figures['training_s']:.0f} s  "
                             f"ETA {clock(ends_at - now)}",
                             soft_wrap=True, highlight=False,
                         )  # fmt: skip

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from rich.table import Column, Table
 
 from cluster.report.stress import Stress
+from cluster.text import km_per_collision
 
 
 def held_out_table(title: str, figures: Mapping[str, float], target: float) -> Table:
@@ -15,6 +16,7 @@ def held_out_table(title: str, figures: Mapping[str, float], target: float) -> T
     table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")
+    table.add_row("kilometres per collision", km_per_collision(figures))
     table.add_row("stopped, astray, or out of time", f"{1.0 - figures['success_rate'] - figures['collision_rate']:.1%}")
     return table
 

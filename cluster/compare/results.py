@@ -39,8 +39,8 @@ ERROR_FIGURES = {
 }
 """A champion's errors against the reference, by their names in `gridsim.reference`."""
 RUN_FIGURES = (
-    "success_rate", "distance_m", "speed_mps", "collision_rate", "car_steps", "wall_s", "training_s", "best_car_steps",
-    "best_wall_s",
+    "success_rate", "distance_m", "speed_mps", "collision_rate", "km_per_collision", "car_steps", "wall_s",
+    "training_s", "best_car_steps", "best_wall_s",
 )  # fmt: skip
 """A run's figures: held-out drives, what it cost from start to end, how long it trained (without measuring the
 champion), and what training had cost when the final champion was bred."""

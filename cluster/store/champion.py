@@ -181,8 +181,8 @@ def evaluate(
     Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed; other cars on the
     road (default: as many as it learned among, or as the other scenario has by default); what `SimConfig.load` takes,
     in place of the simulator's numbers that it learned with.
-    Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
-    held-out figures of summary.json.
+    Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means), km_per_collision. With the defaults
+    these are the held-out figures of summary.json.
     Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.
     """
     champion = champion.in_sim(sim)

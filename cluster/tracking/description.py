@@ -15,6 +15,7 @@ from typing import Any
 from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store.champion import load_champion
 from cluster.store.folder import FILES
+from cluster.text import km_per_collision
 from cluster.tracking.address import TrackingError
 from cluster.tracking.content import CHAMPION_TAG, Content, Model
 from evolution.networks.export import example
@@ -126,7 +127,7 @@ def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> s
         f"{found} after {summary[step]:,} {step}, {summary['car_steps'] / 1e6:,.1f} million car-steps and "
         f"{summary['wall_s']:,.0f} s. On {held_out['episodes']} held-out drives the champion succeeds in "
         f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
-        f"m/s, and collides in {held_out['collision_rate']:.1%}.",
+        f"m/s, and collides in {held_out['collision_rate']:.1%}: {km_per_collision(held_out)} km per collision.",
         "Watch it: `drive.html` among the artifacts, or",
         f"    gridsim-watch {shlex.quote(str(folder))}",
         f"Load it, an ONNX model from the environment's observations to its actions, n at a time, registered as "

@@ -8,13 +8,19 @@ from gridsim.state import End
 
 
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
-    """Means over the episodes of one member, RESULT [e]; `period_s` is the control period."""
+    """Means over the episodes of one member, RESULT [e]; `period_s` is the control period.
+
+    Kilometres per collision are those of all episodes over their collisions; without a collision all of them, so that
+    it takes more than that.
+    """
+    kilometres, collisions = results["distance"].sum(dtype=np.float64) / 1000.0, results["end"] == End.COLLISION
     return {
         "episodes": len(results),
         "success_rate": float((results["end"] == End.SUCCESS).mean()),
         "distance_m": float(results["distance"].mean()),
         "speed_mps": mean_speed(results, period_s),
-        "collision_rate": float((results["end"] == End.COLLISION).mean()),
+        "collision_rate": float(collisions.mean()),
+        "km_per_collision": float(kilometres / max(int(collisions.sum()), 1)),
     }
 
 

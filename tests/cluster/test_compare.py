@@ -87,7 +87,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(
         (tmp_path / f"{kind}-{name}").touch()
     code, out, err = made.run(*ASKED, "--name", "c", "--seeds", 1)
     assert (code, asked()) == (1, names[:4])
-    assert f"run 2/4  {names[1]}: success 50%, 90 m, 6 s  ETA 0:" in out
+    assert f"run 2/4  {names[1]}: success 50%, 90 m, 0.18 km per collision, 6 s  ETA 0:" in out
     for line in (
         f"{names[0]}: warning: MLflow is slow",
         f"{names[2]}: error: the workers are gone",

@@ -13,7 +13,10 @@ from cluster.store.folder import RunFolder
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
-HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 90.0, "speed_mps": 7.0, "collision_rate": 0.5}
+HELD_OUT = {
+    "episodes": 64, "success_rate": 0.5, "distance_m": 90.0, "speed_mps": 7.0, "collision_rate": 0.5,
+    "km_per_collision": 0.18,
+}  # fmt: skip
 
 
 def make_run(folder, learner="evolution", scenario="curved", seed=0, settings=None):

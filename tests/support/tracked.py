@@ -27,7 +27,10 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
-HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.5, "collision_rate": 0.5}
+HELD_OUT = {
+    "episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.5, "collision_rate": 0.5,
+    "km_per_collision": 2.0,
+}  # fmt: skip
 MODEL = "gridsim-curved-evolution"
 # With it scripts find the packages and this file, whatever the working directory.
 PYTHONPATH = os.pathsep.join([str(Path(cluster.__file__).resolve().parents[1]), str(Path(__file__).parent)])
