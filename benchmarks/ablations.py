@@ -113,7 +113,7 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     maps = Maps(scenario, settings.simulator())
     learner = Evolution(settings, open_pool(0, None, 0.0, maps.build), maps)
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
-    learner.curriculum = Curriculum(config, seed, maps.get, maps.config, settings.traffic)
+    learner.curriculum = Curriculum(config, seed, maps.get, maps.config, settings.crowds)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
     learner.search = variant.search(learner.search.space, search, seed)
     found = []

@@ -79,7 +79,7 @@ class Generations:
         champion = load_champion(DRIVER)
         self._scenario, self._policy, self._pool = settings.scenario, champion.policy, pool
         self._curriculum = Curriculum(
-            settings.curriculum(), settings.seed, partial(build, settings.scenario), SimConfig(), settings.traffic
+            settings.curriculum(), settings.seed, partial(build, settings.scenario), SimConfig(), settings.crowds
         )
         self._curriculum.target = self._curriculum.config.last_target
         self._search = Recombination(space(PolicySpec.parse(champion.policy)), settings.search_config(), settings.seed)

@@ -19,7 +19,8 @@ from evolution.networks.policy import Actions, PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.parts import TRAINING_SEED
+from gridsim.maps.parts import TRAINING_SEED, road_number
+from gridsim.maps.scenarios import Traffic
 
 MAPS = 128  # training maps from which episodes are drawn
 MAX_EPISODES = 10_000
@@ -40,7 +41,7 @@ class Evaluator:
         self,
         scenario: str = "seamless",
         policy: str = "",
-        traffic: int = -1,
+        traffic: Traffic = -1,
         sim: SimConfig | str = "default",
         workers: int = 0,
         address: str | None = None,
@@ -52,7 +53,7 @@ class Evaluator:
         Args:
             scenario: a road's name, or a map file.
             policy: the network, as for --policy of gridsim-evolve, whose default is this one's.
-            traffic: other cars; -1 is as many as the road usually has.
+            traffic: other cars, usual, heavy or a number; -1 is as many as the road has by default.
             sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these. A lower target
                 and time limit make an evaluation shorter.
             workers, address: Ray workers, and a cluster's address; by default this process's threads.
@@ -73,7 +74,7 @@ class Evaluator:
         self._settings, self._sim, self._episodes = settings, SimConfig.load(sim), episodes
         self.spec = PolicySpec.parse(settings.policy)
         self.genes: int = self.spec.size
-        self._maps = Maps(scenario, self._sim)
+        self._maps = Maps(settings.scenario, self._sim)
         try:
             self._pool = open_pool(workers, cluster_address(address or ""), 0.0, self._maps.build)
         except BaseException:
@@ -118,8 +119,9 @@ class Evaluator:
         used, local = np.unique(rng.integers(MAPS, size=self._episodes), return_inverse=True)
         seeds = [TRAINING_SEED + m for m in used.tolist()]
         self._maps.ahead(seeds)
-        maps = [self._maps.get(each) for each in seeds]
-        return Episodes(seeds, *lane_starts(maps, local, rng, self._settings.traffic, self._sim))
+        maps, crowds = [self._maps.get(each) for each in seeds], self._settings.crowds
+        cars = [crowds[road_number(each, len(crowds))] for each in seeds]
+        return Episodes(seeds, *lane_starts(maps, local, rng, cars, self._sim, max(crowds)))
 
     def _drive(self, genomes: np.ndarray, episodes: Episodes, comfort: bool = False) -> np.ndarray:
         members = Generation(np.zeros((0, self.genes), np.float32), recipes(0)).and_copies(self._checked(genomes))

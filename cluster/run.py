@@ -36,7 +36,8 @@ from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_EPISODES, HELD_OUT_SEEDS, VALIDATION_SEEDS, spread_starts
 from evolution.episodes.figures import summarise
-from gridsim.maps.parts import held_out_place
+from gridsim.maps.parts import held_out_place, roads_of, seeds_on
+from gridsim.maps.scenarios import label
 
 WAIT_FOR_MLFLOW_S = 30.0  # at most, for MLflow's id of the run, which summary.json has to hold
 
@@ -150,7 +151,8 @@ class Session:
         self._state: State | None = None  # the learner's after the last step; None once that is saved
         self._saved_at = -math.inf
         self._away = False  # whether an outage of MLflow was reported
-        self.maps.ahead([*learning.curriculum.map_seeds[:3], *VALIDATION_SEEDS])
+        self._roads = roads_of(settings.scenario)
+        self.maps.ahead([*learning.curriculum.map_seeds[:3], *seeds_on(VALIDATION_SEEDS, len(self._roads))])
 
     def wall_s(self) -> float:
         """Seconds that the run has taken, in this process and before."""
@@ -206,19 +208,20 @@ class Session:
         from cluster.report.report import write_report
 
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        self.maps.ahead(HELD_OUT_SEEDS)
+        self.maps.ahead(seeds_on(HELD_OUT_SEEDS, len(self._roads)))
         finish(learning.choose_champion(), self.on_event)
         best, car_steps, sim = learning.champion, learning.car_steps, learning.sim
         assert best is not None
         champion = Champion(best.genome, settings.policy, settings.scenario, sim, settings.traffic)
         champion.save(path / CHAMPION)
         champion.export_onnx(path / ONNX)
-        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.traffic, sim)
+        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.crowds, sim)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
         self.on_event(next(driving))  # the workers drive, and meanwhile:
         write_report(self.run, champion, learning.history, write_elites(path, settings.policy), self.maps.get, episodes)
         driven = finish(driving, self.on_event)
-        row, wall = learning.history[best.step], self.wall_s()
+        row, wall, period, roads = learning.history[best.step], self.wall_s(), sim.episode.control_period, self._roads
+        on_each = driven.results[0].reshape(len(roads), -1)
         self.summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracking.wait_id(WAIT_FOR_MLFLOW_S),
@@ -237,6 +240,7 @@ class Session:
             "training_s": learning.history[-1]["wall_s"],
             **{f"best_{name}": row[name] for name in ("car_steps", "wall_s")},
             "held_out_place": held_out_place(settings.scenario, self.maps.get(HELD_OUT_SEEDS.start)),
-            "held_out": summarise(driven.results[0], sim.episode.control_period),
+            "held_out": summarise(driven.results[0], period),
+            "held_out_by_road": {label(road): summarise(own, period) for road, own in zip(roads, on_each, strict=True)},
         }
         checkpoint.write_json(path / SUMMARY, self.summary)

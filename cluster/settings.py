@@ -7,7 +7,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -18,11 +18,15 @@ from evolution.networks.policy import CONTINUOUS, Actions, Observation, PolicySp
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.parts import is_map_file
+from gridsim.maps.parts import roads_of
 from gridsim.maps.scenarios import (
+    ALL,
+    AMOUNTS,
     REGISTRY,
+    Traffic,
     check_name,
-    default_traffic,
+    crowds,
+    full_name,
     has_lanes,
     speed_interval,
 )
@@ -37,7 +41,8 @@ IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
 
 ROADS = f"{', '.join(REGISTRY)}, or a file of a map or a road, or a folder of them (docs/roads.md)."
-SCENARIO = tyro.conf.arg(help=f"Road to learn on: {ROADS}")
+SEVERAL = f"{ALL}, or several of these, separated by commas, are one driver's roads."
+SCENARIO = tyro.conf.arg(help=f"Road to learn on: {ROADS[:-1]}; {SEVERAL}")
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -52,8 +57,9 @@ class RunSettings(ABC):
     verb: ClassVar[str]  # what is done to a network
 
     scenario: Annotated[str, SCENARIO] = "seamless"
-    traffic: Annotated[int, IN_WORDS] = -1
-    """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
+    traffic: Annotated[Traffic, IN_WORDS] = -1
+    """Other cars on the road: usual, heavy (twice as many) or a number. By default as each road has it (docs/roads.md),
+    on several roads usual."""
     sim: str = "default"
     """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
     seed: int = 0
@@ -66,18 +72,22 @@ class RunSettings(ABC):
     """Car-steps at most; the last generation may exceed it. By default 60 million, and any number with
     --generations."""
     until: float = 0.99
-    """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never."""
+    """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never. With
+    several roads the worst one counts."""
 
     pace: Annotated[float, IN_WORDS] = 0.0
     """Mean speed in m/s that a champion should reach: slower success counts for less, and training's time limits
     follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
-        for name, is_file in (("scenario", is_map_file), ("sim", names_file)):
-            if is_file(value := getattr(self, name)):  # absolute: config.json may be read from another folder
-                object.__setattr__(self, name, os.path.abspath(value))
-        if self.traffic == -1:
-            object.__setattr__(self, "traffic", default_traffic(self.scenario, self.simulator()))
+        object.__setattr__(self, "scenario", full_name(self.scenario))  # config.json may be read from another folder
+        if names_file(self.sim):
+            object.__setattr__(self, "sim", os.path.abspath(self.sim))
+        cars = crowds(self.scenario, None if self.traffic == -1 else self.traffic, self.simulator())
+        if len(cars) == 1 or not any(cars):
+            object.__setattr__(self, "traffic", cars[0])
+        elif self.traffic == -1:
+            object.__setattr__(self, "traffic", "usual")
         for name, value in self.defaults().items():
             if not getattr(self, name):
                 object.__setattr__(self, name, value)
@@ -100,20 +110,28 @@ class RunSettings(ABC):
         """The simulator's numbers. Raises GridSimError."""
         return SimConfig.load(self.sim)
 
+    @property
+    def crowds(self) -> tuple[int, ...]:
+        """Other cars on each of its roads."""
+        return crowds(self.scenario, self.traffic, self.simulator())
+
     def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run: it suits the scenario, the car's size, and traffic if there is any."""
-        sim, usual = self.simulator(), CurriculumConfig()
-        low, _ = speed_interval(self.scenario, sim)
-        above, champion_above = (0.8, 0.3) if self.traffic else (2.0, 0.85)
-        pace, champion_pace = low + above * sim.pace, low + champion_above * sim.pace
+        """The curriculum of such a run: it suits its roads, the car's size, and traffic if there is any."""
+        sim, usual, roads = self.simulator(), CurriculumConfig(), roads_of(self.scenario)
+        lows = [speed_interval(road, sim)[0] for road in roads]
+        above = [(0.8, 0.3) if cars else (2.0, 0.85) for cars in self.crowds]
+        pace, champion_pace = (
+            tuple(low + more[k] * sim.pace for low, more in zip(lows, above, strict=True)) for k in range(2)
+        )
         if self.pace:
-            pace, champion_pace = self.pace + 1.15 * sim.pace, self.pace
+            pace, champion_pace = (self.pace + 1.15 * sim.pace,), (self.pace,)
         # In traffic, chance matters more: it takes more episodes to see how well a network drives.
         episodes = 3 if self.traffic else 1
         metres = {name: getattr(usual, name) * sim.unit for name in ("crash_target", "first_target", "last_target")}
         rewind = max(round(usual.rewind * 0.1 * sim.pace / sim.episode.control_period), 1)  # of usual steps of 0.1 s
         return replace(
-            usual, pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes, **metres,
+            usual, pace=pace, champion_pace=champion_pace, first_maps=usual.first_maps * len(roads),
+            starts=episodes, crash_starts=episodes, **metres,
             rewind=rewind, slack=usual.slack * sim.pace,
         )  # fmt: skip
 
@@ -129,17 +147,21 @@ class RunSettings(ABC):
         """Raises GridSimError, one line that says what to change."""
         _check_types(type(self), vars(self))
         check_name(self.scenario)
-        sim = self.simulator()
-        if is_map_file(self.scenario):
-            speed_interval(self.scenario, sim)  # reads all of its files
-        self._check_range(0, MAX_TRAFFIC, "traffic")
-        if self.traffic and not has_lanes(self.scenario):
-            raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
-        check_traffic(self.traffic, sim)
+        sim, roads = self.simulator(), roads_of(self.scenario)
+        (low, high), *_ = [speed_interval(road, sim) for road in roads]  # reads all files
+        if not all(0 <= cars <= MAX_TRAFFIC for cars in self.crowds):
+            raise GridSimError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        if any(self.crowds) and (without := [road for road in roads if not has_lanes(road)]):
+            remedy = "use --traffic 0" + (", or leave it out of --scenario" if len(roads) > 1 else "")
+            raise GridSimError(f"--traffic {self.traffic}: {without[0]} has no lanes for traffic; {remedy}")
+        check_traffic(max(self.crowds), sim)
         self._check_range(0, (1 << 63) - 1, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
-        low, high = speed_interval(self.scenario, sim)
+        if self.pace and len(roads) > 1:
+            raise GridSimError(
+                f"--pace {self.pace:g}: each of the {len(roads)} roads has a pace of its own; leave it out"
+            )
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
         spec = PolicySpec.parse(self.policy)
@@ -207,7 +229,7 @@ class EvolveSettings(RunSettings):
             object.__setattr__(self, "policy", self.policy.removesuffix(CONTINUOUS) + CONTINUOUS)
 
     def defaults(self) -> dict[str, Any]:
-        alone = not self.traffic
+        alone = not any(self.crowds)
         rays = "mlp:64+steering" if alone else "mlp:64+motion+steering"
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
@@ -362,7 +384,9 @@ def _check_types(kind: type[RunSettings], values: Mapping[str, Any]) -> None:
         if name not in usual:
             raise GridSimError(f"unknown setting {name!r}, perhaps of another version of GridSim; start a new run")
         wanted, choices = type(usual[name]), get_args(hints[name])
+        if name == "traffic" and value in AMOUNTS:
+            continue
         if type(value) is not wanted and not (wanted is float and type(value) is int):
             raise GridSimError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
-        if choices and value not in choices:
+        if get_origin(hints[name]) is Literal and value not in choices:
             raise GridSimError(f"--{name.replace('_', '-')} must be {' or '.join(choices)}, not {value}")

@@ -11,9 +11,15 @@ def count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def cars(traffic: int | str) -> str:
+    """Traffic in words: `6 cars`, or `usual traffic`."""
+    return f"{traffic} traffic" if isinstance(traffic, str) else f"{traffic} cars"
+
+
 def km_per_collision(figures: Mapping[str, float]) -> str:
     """Kilometres per collision of `figures.summarise`; without a collision, which distance was driven."""
-    return f"{'' if figures['collision_rate'] else 'more than '}{figures['km_per_collision']:,.3g}"
+    km = figures["km_per_collision"]
+    return ("" if figures["collision_rate"] else "more than ") + (f"{km:,.0f}" if km >= 100.0 else f"{km:.3g}")
 
 
 def file_name(words: str) -> str:

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
@@ -35,13 +36,13 @@ from cluster.commands.common import (
 )
 from cluster.commands.entry import STARTED
 from cluster.commands.progress import RunDisplay
-from cluster.commands.tables import errors_table, held_out_table, stress_table
+from cluster.commands.tables import driving_table, errors_table, stress_table
 from cluster.compare.results import series
 from cluster.report import stress
 from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.stopping import INTERRUPTED
-from cluster.store.champion import Champion, evaluate, load_champion
+from cluster.store.champion import Champion, drives, load_champion
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError, write_json
 from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.text import as_argument, count
@@ -49,10 +50,11 @@ from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
 from cluster.tracking.tracking import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
+from evolution.episodes.figures import summarise
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.parts import is_map_file
-from gridsim.maps.scenarios import has_lanes, label
+from gridsim.maps.scenarios import Traffic, has_lanes, label
 from gridsim.reference import errors
 
 
@@ -150,7 +152,7 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         base = kind(settings, WorkFlags(output=str(run.path.parent)) if run else WorkFlags(), start)
         flags = parse(kind, prog, arguments, base)
     settings = flags.learning
-    if settings.traffic and not has_lanes(settings.scenario):
+    if settings.traffic and len(settings.crowds) == 1 and not has_lanes(settings.scenario):
         print(f"{prog}: {settings.scenario} has no lanes for traffic; running without", file=sys.stderr)
         return _prepare(prog, [*arguments, "--traffic", "0"])
     check_workers(flags.work.workers, flags.work.patience)
@@ -227,7 +229,8 @@ def _learn(prog: str) -> int:
         resume += f" --fitness {shlex.quote(given)}"
     hint = f"continue with: {resume}"
     verb = "continuing" if run.saved else settings.verb
-    console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}", soft_wrap=True)
+    road = settings.scenario if len(settings.crowds) == 1 else label(settings.scenario)
+    console.print(f"{verb} {settings.policy} on {road}, seed {settings.seed} -> {folder}", soft_wrap=True)
     try:
         initial = load_champion(run.init).genome if run.init and run.saved is None else None
         with RunDisplay(console, settings) as shown:
@@ -276,7 +279,8 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, settings, path = session.summary, session.run.settings, session.run.path
     title = f"The champion on {summary['held_out_place']}"
-    console.print(held_out_table(title, summary["held_out"], session.learning.sim.episode.target))
+    target, roads = session.learning.sim.episode.target, summary["held_out_by_road"]
+    console.print(driving_table(title, summary["held_out"], roads, settings.crowds, target))
     steps, solved = count(summary[f"{settings.step_name}s"], settings.step_name), summary["solved"]
     reached = [name for name in settings.extendable if 0 < getattr(settings, name) <= summary[name]]
     longer = " ".join(f"{as_flag(name)} {2 * summary[name]}" for name in reached)
@@ -299,25 +303,29 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
     champion = load_champion(flags.champion).in_sim(flags.sim)
-    road = flags.scenario or champion.scenario
-    traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
-    chosen = (road, flags.episodes, flags.seed, traffic)
-    figures = evaluate(champion, *chosen)
+    name, episode = flags.scenario or champion.scenario, champion.sim.episode
+    chosen = (name, flags.episodes, flags.seed, flags.asked)
+    driven = list(drives(champion, *chosen))
+    roads = {label(road): summarise(results, episode.control_period) for road, _, results in driven}
+    figures = summarise(np.concatenate([results for _, _, results in driven]), episode.control_period)
     missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
     place = Path(flags.champion)
     picture = (place if place.is_dir() else place.parent) / stress.PICTURE
     found = _stress(champion, chosen, picture, flags) if flags.stress else []
     if flags.json:
-        more: dict[str, Any] = {} if missed is None else {"errors": missed}
+        more: dict[str, Any] = {"by_road": roads} if len(roads) > 1 else {}
+        if missed is not None:
+            more["errors"] = missed
         if found:
             more["stress"] = [
                 {"what": f"{each.part}.{each.name}", "level": level, **driven} for each, level, driven in found
             ]
         print(json.dumps({**figures, **more}))
         return 0
-    title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
-    title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
-    new_console().print(held_out_table(title, figures, champion.sim.episode.target))
+    crowds, title = [cars for _, cars, _ in driven], f"{flags.champion} on {', '.join(roads)}"
+    title += f", {crowds[0]} cars" if crowds[0] and len(roads) == 1 else ""
+    title += "" if is_map_file(driven[0][0]) else f", maps from seed {flags.seed:,}"
+    new_console().print(driving_table(title, figures, roads, crowds, episode.target))
     if missed is not None:
         new_console().print(errors_table("Errors against the reference driver", missed))
     if found:
@@ -325,7 +333,9 @@ def _evaluate() -> int:
     return 0
 
 
-def _stress(champion: Champion, chosen: tuple[str, int, int, int], picture: Path, flags: EvaluateFlags) -> list[Any]:
+def _stress(
+    champion: Champion, chosen: tuple[str, int, int, Traffic | None], picture: Path, flags: EvaluateFlags
+) -> list[Any]:
     """Drive a champion under each stress, and draw it."""
     asked = stress.stresses(champion)
     drives = stress.drive(champion, asked, *chosen)

@@ -29,6 +29,7 @@ from cluster.text import as_argument
 from cluster.workers.cores import cores
 from gridsim.errors import GridSimError
 from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import AMOUNTS, Traffic
 
 T = TypeVar("T")
 FAILED, WRONG_USE = 1, 2  # exit codes
@@ -61,6 +62,21 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
     return tyro.constructors.PrimitiveConstructorSpec(1, "INT", read, lambda x: isinstance(x, int), lambda x: [str(x)])
 
 
+@registry.primitive_rule
+def _traffic(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Traffic] | None:
+    """Traffic: its name, or a whole number."""
+    if field.type != Traffic:
+        return None
+
+    def read(words: list[str]) -> Traffic:
+        if words[0] not in AMOUNTS and not re.fullmatch(r"[+-]?\d+", words[0]):
+            raise ValueError(f"'{words[0]}' is neither {', '.join(AMOUNTS)} nor a whole number")
+        return words[0] if words[0] in AMOUNTS else int(words[0])  # type: ignore[return-value]
+
+    metavar = "|".join([*AMOUNTS, "INT"])
+    return tyro.constructors.PrimitiveConstructorSpec(1, metavar, read, lambda x: True, lambda x: [str(x)])
+
+
 @dataclass(frozen=True)
 class WorkFlags:
     """Where runs are computed, kept and logged."""
@@ -85,13 +101,19 @@ class RoadFlags:
     """Which road a champion drives on."""
 
     scenario: Annotated[str, IN_WORDS] = ""
-    """Road to drive on; by default the one it learned on."""
+    """Road to drive on, or several, separated by commas, or all; by default as it learned."""
     sim: Annotated[str, IN_WORDS] = ""
     """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file; by default those it learned with."""
-    traffic: Annotated[int, IN_WORDS] = -1
-    """Other cars on the road; by default as many as it learned among, or as another road usually has."""
+    traffic: Annotated[Traffic, IN_WORDS] = -1
+    """Other cars on the road: usual, heavy or a number; by default as many as it learned among, on another road as many
+    as that has by default."""
     seed: int = HELD_OUT_SEED
     """Seed of the first map; held-out maps have seeds from 2,000,000 on."""
+
+    @property
+    def asked(self) -> Traffic | None:
+        """The traffic that is asked for, None for the default."""
+        return None if self.traffic == -1 else self.traffic
 
 
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:

@@ -8,8 +8,34 @@ from cluster.report.stress import Stress
 from cluster.text import km_per_collision
 
 
-def held_out_table(title: str, figures: Mapping[str, float], target: float) -> Table:
-    """How well a champion drives on roads it never saw, where `target` m are success."""
+def driving_table(
+    title: str,
+    figures: Mapping[str, float],
+    roads: Mapping[str, Mapping[str, float]],
+    crowds: Sequence[int],
+    target: float,
+) -> Table:
+    """How well a champion drives where it never was, and a row for each of several roads, among so many other cars.
+
+    `target` m without a collision are success.
+    """
+    if len(roads) == 1:
+        return _one_road(title, figures, target)
+    heads = "cars", "success", "km/collision", "m/s", "collisions", "other"
+    columns = (Column(head, justify="left" if not head else "right", no_wrap=True) for head in ("", *heads))
+    table = Table(*columns, title=title, title_justify="left")
+    rows = list(zip(roads, map(str, crowds), roads.values(), strict=True))
+    for road, cars, row in [*rows, ("all", "", figures)]:
+        success, collisions = row["success_rate"], row["collision_rate"]
+        other, speed = f"{1.0 - success - collisions:.1%}", f"{row['speed_mps']:.2f}"
+        last = road == rows[-1][0]
+        shares = f"{success:.1%}", km_per_collision(row), speed, f"{collisions:.1%}", other
+        table.add_row(road, cars, *shares, end_section=last)
+    table.caption = f"{figures['episodes'] / len(roads):.0f} episodes each; success: {target:,g} m without a collision"
+    return table
+
+
+def _one_road(title: str, figures: Mapping[str, float], target: float) -> Table:
     table = Table("", Column(justify="right"), title=title, title_justify="left", show_header=False)
     table.add_row("episodes", f"{figures['episodes']:.0f}")
     table.add_row(f"success ({target:,g} m without a collision)", f"{figures['success_rate']:.1%}")

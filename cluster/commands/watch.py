@@ -32,8 +32,8 @@ from cluster.store.steps import read_elites
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
-from gridsim.maps.parts import is_map_file
-from gridsim.maps.scenarios import build, check_name, default_traffic, label
+from gridsim.maps.parts import is_map_file, road_number
+from gridsim.maps.scenarios import Traffic, build, check_name, full_name, label, traffic_on
 from gridsim.state import End
 from gridsim.traffic.world import spawn
 from gridsim.view.drive import Recorder, drive, read_drive, replay
@@ -90,8 +90,8 @@ class DriveFlags:
     scenario: Annotated[str, tyro.conf.arg(help=f"Road to drive on: {ROADS}")] = "seamless"
     sim: str = "default"
     """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
-    traffic: Annotated[int, IN_WORDS] = -1
-    """Other cars on the road; by default as many as it usually has."""
+    traffic: Annotated[Traffic, IN_WORDS] = -1
+    """Other cars on the road: usual, heavy or a number; by default as for gridsim-evolve."""
     record: Annotated[str, IN_WORDS] = ""
     """Record the drive to this new CSV file."""
     seed: int = 0
@@ -111,7 +111,7 @@ class _Window(Window):
         return pressed
 
 
-def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
+def _size_and_seconds(size: str, seconds: float, traffic: Traffic) -> tuple[tuple[int, int], float]:
     """Width and height in pixels, and seconds, infinite for 0. Raises GridSimError if these or --traffic are wrong."""
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
@@ -119,7 +119,7 @@ def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[in
         raise GridSimError(f"--size {size}: give width x height, even and from 64 to 4096, as in 640x360")
     if not 0.0 <= seconds <= 36_000.0:
         raise GridSimError(f"--seconds must be 0 to 36,000, not {seconds:g}")
-    if not -1 <= traffic <= MAX_TRAFFIC:
+    if isinstance(traffic, int) and not -1 <= traffic <= MAX_TRAFFIC:
         raise GridSimError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {traffic}")
     return (width, height), seconds or math.inf
 
@@ -138,7 +138,7 @@ def _watch() -> int:
     usual = "640x360" if flags.output else "960x640"
     size, seconds = _size_and_seconds(flags.size or usual, flags.seconds, flags.traffic)
     if flags.scenario:
-        check_name(flags.scenario)
+        check_name(full_name(flags.scenario))
     if flags.follow and (flags.output or flags.generation is not None):
         raise GridSimError("--follow shows the newest elite in a window; leave out --output and --generation")
     output = Path(flags.output)
@@ -191,14 +191,20 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
         return
     source = Path(flags.source)
     for seed in itertools.count(flags.seed) if not flags.output else (flags.seed,):
-        elite = flags.follow or flags.generation is not None
-        champion, name = _elite(source, flags.generation) if elite else (load_champion(source), "champion")
-        champion = champion.in_sim(flags.sim)
-        road = flags.scenario or champion.scenario
+        champion, name = _driver(source, flags)
+        road = full_name(flags.scenario or champion.scenario)
         scenario, start = _map(road, seed, champion.sim)
-        traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
-        world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim)[0]
+        crowds = champion.crowds_on(road, flags.asked)
+        cars = crowds[road_number(seed, len(crowds))]
+        world = spawn(scenario.network, start[None], cars, np.array([scenario.seed]), champion.sim)[0]
         yield record(champion, scenario, start, seconds, world), name
+
+
+def _driver(source: Path, flags: WatchFlags) -> tuple[Champion, str]:
+    """Who drives, and its name."""
+    elite = flags.follow or flags.generation is not None
+    champion, name = _elite(source, flags.generation) if elite else (load_champion(source), "champion")
+    return champion.in_sim(flags.sim), name
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
@@ -233,7 +239,8 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
             mark = str(k) if not flags.beside else of if k == 1 else f"{of} {k}"
             shown.append(Shown(f"{name} of {source}", mark, found))
             if not _is_recording(source):  # the others drive on the same road, among as many cars
-                flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
+                road = flags.scenario or _driver(Path(source), flags)[0].scenario
+                flags = dataclasses.replace(flags, scenario=road, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     if len({each.drive.sim.vehicle for each in shown}) > 1:
@@ -290,8 +297,8 @@ def _drive() -> int:
     size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
     sim = os.path.abspath(flags.sim) if names_file(flags.sim) else flags.sim
     config = SimConfig.load(sim)
-    scenario, start = _map(flags.scenario, flags.seed, config)
-    traffic = default_traffic(flags.scenario, config) if flags.traffic == -1 else flags.traffic
+    scenario, start = _map(full_name(flags.scenario), flags.seed, config)
+    traffic = traffic_on(scenario.name, None if flags.traffic == -1 else flags.traffic, config)
     with contextlib.closing(_Window(size, f"GridSim: {flags.scenario}")) as window:
         recorder = Recorder(flags.record, scenario, traffic, sim) if flags.record else None
         try:

@@ -26,8 +26,7 @@ from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
 from gridsim.config import names_file
 from gridsim.errors import GridSimError
-from gridsim.maps.parts import is_map_file
-from gridsim.maps.scenarios import REGISTRY, label
+from gridsim.maps.scenarios import REGISTRY, Traffic, full_name, label
 from gridsim.packages import DISTRIBUTION
 
 COMPARISON = "comparison.json"
@@ -60,8 +59,8 @@ class Plan:
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
     sim: str = "default"
     """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
-    traffic: Annotated[int, IN_WORDS] = -1
-    """Other cars on the road; by default as many as each road usually has."""
+    traffic: Annotated[Traffic, IN_WORDS] = -1
+    """Other cars on the road: usual, heavy or a number; by default as for gridsim-evolve."""
     population: Annotated[int, IN_WORDS] = 0
     """Members of a generation, of evolution and random search; by default as for gridsim-evolve."""
     generations: Annotated[int, IN_WORDS] = 0
@@ -71,8 +70,7 @@ class Plan:
     own."""
 
     def __post_init__(self) -> None:
-        absolute = tuple(os.path.abspath(name) if is_map_file(name) else name for name in self.scenarios)
-        object.__setattr__(self, "scenarios", absolute)
+        object.__setattr__(self, "scenarios", tuple(map(full_name, self.scenarios)))
         if names_file(self.sim):
             object.__setattr__(self, "sim", os.path.abspath(self.sim))
 

@@ -23,6 +23,7 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.parts import HELD_OUT_SEED
+from gridsim.maps.scenarios import Traffic
 from gridsim.reference import Series, error_series, errors
 from gridsim.state import poses_of
 
@@ -85,20 +86,20 @@ def measured(run: Run) -> Run:
     return dataclasses.replace(run, figures={**run.figures, **missed})
 
 
-def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: int) -> list[Series]:
+def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: Traffic | None) -> list[Series]:
     """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference`.
 
     Episodes in which it does not drive a metre forward are left out.
 
     Args: as for `champion.evaluate`. Raises: GridSimError as it does; Stopped.
     """
-    chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
     sim, episode, spec = champion.sim, champion.sim.episode, PolicySpec.parse(champion.policy)
-    found = []
-    for row, world in zip(chosen.rows, chosen.worlds, strict=True):
-        stopping.check()
-        road = roads[row["map"]]
-        _, states, _ = trajectory(spec, champion.genome, road, row["start"], episode.target, episode.steps, sim, world)
-        with contextlib.suppress(ValueError):  # raised if the car did not drive a metre forward
-            found.append(error_series(poses_of(states), road, sim.vehicle))
+    limits, found = (episode.target, episode.steps, sim), list[Series]()
+    for _, _, chosen, maps in held_out(champion, scenario, episodes, seed, traffic):
+        for row, world in zip(chosen.rows, chosen.worlds, strict=True):
+            stopping.check()
+            road_map = maps[row["map"]]
+            _, states, _ = trajectory(spec, champion.genome, road_map, row["start"], *limits, world)
+            with contextlib.suppress(ValueError):  # raised if the car did not drive a metre forward
+                found.append(error_series(poses_of(states), road_map, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

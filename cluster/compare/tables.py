@@ -13,8 +13,8 @@ import numpy as np
 
 from cluster.compare.plan import Plan
 from cluster.compare.results import ERROR_FIGURES, RUN_FIGURES, Run
-from cluster.text import count
-from gridsim.maps.scenarios import label
+from cluster.text import cars, count
+from gridsim.maps.scenarios import Traffic, label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
 LIMITS = ("seed", "until", "generations", "car_steps", "episodes")  # settings in which variants do not differ
@@ -51,7 +51,7 @@ def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
         made = {run.settings: run for run in runs}
         planned = plan.planned(Path())
         runs = [made.get(run.settings) or Run(run.path, run.settings, "", {}) for run in planned]
-    of_learner: dict[tuple[str, int, str, str], list[Run]] = {}  # on a road
+    of_learner: dict[tuple[str, Traffic, str, str], list[Run]] = {}  # on a road
     for run in runs:
         s = run.settings
         of_learner.setdefault((s.scenario, s.traffic, s.learner, s.observation), []).append(run)
@@ -59,7 +59,7 @@ def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
     for (scenario, traffic, learner, observation), alike in of_learner.items():
         several_traffics = len({other for name, other, *_ in of_learner if name == scenario}) > 1
         several_observations = len({other for *_, other in of_learner}) > 1
-        road = label(scenario) + (f", {traffic} cars" if several_traffics else "")
+        road = label(scenario) + (f", {cars(traffic)}" if several_traffics else "")
         words = NAMES[learner] + (f" on {observation}" if several_observations else "")
         varied = [name for name in vars(alike[0].settings) if len({getattr(run.settings, name) for run in alike}) > 1]
         for run in alike:
@@ -142,5 +142,5 @@ def introduction(plan: Plan | None) -> str:
             "machine takes some 20 s more, to compile the simulator."
         )
     sensors = {"rays": "31 rays", "grid": "the occupancy grid"}
-    traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{plan.traffic} other cars"
+    traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{cars(plan.traffic)} beside it"
     return f"{count(plan.seeds, 'seed')}, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."

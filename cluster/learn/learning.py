@@ -51,9 +51,10 @@ class Champion:
     """The best network found so far, and its figures in the validation episodes."""
 
     genome: np.ndarray  # float32 [genes]
-    score: float = 0.0  # `Curriculum.validation_score`
+    score: float = 0.0  # the least of `Curriculum.validation_scores`
     success_rate: float = 0.0
-    tie_break: float = 0.0  # between equal scores: mean distance (m), or the value of a fitness of the user's own
+    # Between equal scores: mean distance (m), of several roads the mean score, or a fitness of the user's own.
+    tie_break: float = 0.0
     step: int = -1  # in which it was found
 
 
@@ -82,7 +83,7 @@ class Learning(ABC):
         s = self.settings
         self.sim = self.maps.config  # what a whole run is simulated with
         self.spec = PolicySpec.parse(s.policy)
-        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim, s.traffic)
+        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim, s.crowds)
 
     @property
     def comfort(self) -> bool:
@@ -144,7 +145,8 @@ class Learning(ABC):
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
         """What champions are compared by, from a candidate's validation, RESULT [1, episodes]; the first decides."""
-        return float(self.curriculum.validation_score(results)[0]), float(results["distance"].mean())
+        scores = self.curriculum.validation_scores(results[0])
+        return float(scores.min()), float(results["distance"].mean() if len(scores) == 1 else scores.mean())
 
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
         """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""

@@ -36,7 +36,7 @@ def write_report(
     road_map, start = get_map(episodes.maps[int(episodes.rows[0]["map"])]), episodes.rows[0]["start"]
     pictures.curves(history, path / CURVES, settings.step_name)
     drive = film.record(champion, road_map, start, limit, episodes.worlds[0])
-    where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
+    where = "" if is_map_file(road_map.name) else f", held-out map {road_map.seed:,}"
     title = f"{label(road_map.name)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
     pictures.trajectory(road_map, drive.cars, path / TRAJECTORY, title)
     shown = [page.Shown("champion", "champion", drive)]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from cluster.report.pictures import drawable, figure_of, plain_style
 from cluster.store.champion import Champion, evaluate
 from gridsim.config import SimConfig
+from gridsim.maps.scenarios import Traffic
 
 PICTURE = "stress.png"
 
@@ -50,7 +51,7 @@ def stresses(champion: Champion) -> list[Stress]:
 
 
 def drive(
-    champion: Champion, chosen: Iterable[Stress], scenario: str, episodes: int, seed: int, traffic: int
+    champion: Champion, chosen: Iterable[Stress], scenario: str, episodes: int, seed: int, traffic: Traffic | None
 ) -> Iterator[tuple[Stress, float, dict[str, float]]]:
     """Drive it at each level of each stress. Yields: the stress, the level, and the figures of `evaluate`."""
     for stress in chosen:

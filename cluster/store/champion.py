@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ from evolution.networks.policy import CnnSpec, PolicySpec, act_on
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
-from gridsim.maps.parts import HELD_OUT_SEED, seed_of_map
-from gridsim.maps.scenarios import build, default_traffic
+from gridsim.maps.parts import HELD_OUT_SEED, roads_of, seed_of_map
+from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name
 
 SIM_FORMAT = 2  # of a champion's `sim`; in format 1, patience and progress were per control step
 GONE = ("apart", "kerb")  # parameters of traffic that no longer exist, in champions of the first format
@@ -41,7 +42,7 @@ class Champion:
     policy: str  #: its network, such as `mlp:6,7`
     scenario: str  #: where it learned
     sim: SimConfig  #: the simulator's parameters it learned with
-    traffic: int = 0  #: other cars that it learned among
+    traffic: Traffic = 0  #: other cars that it learned among, on each of several roads as many as is `usual` or `heavy`
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
@@ -65,11 +66,11 @@ class Champion:
         rollout.policy_buffers(PolicySpec.parse(self.policy), other.sim)  # raises if the rays do not fit the network
         return other
 
-    def traffic_on(self, scenario: str) -> int:
-        """Other cars on a scenario by default: on its own as many as it learned among, elsewhere the usual number."""
-        if scenario == self.scenario and self.sim.unit == 1.0:
-            return self.traffic
-        return default_traffic(scenario, self.sim)
+    def crowds_on(self, scenario: str, asked: Traffic | None = None) -> tuple[int, ...]:
+        """Other cars on each road of a scenario: by default on its own as it learned, elsewhere as usual there."""
+        if asked is None and self.sim.unit == 1.0 and {*roads_of(scenario)} <= {*roads_of(self.scenario)}:
+            asked = self.traffic
+        return crowds(scenario, asked, self.sim)
 
     def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> Any:
         """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
@@ -95,9 +96,9 @@ class Champion:
         """A Gymnasium environment on the champion's scenario, or another."""
         from gridsim.envs.env import GridSimEnv
 
-        scenario = scenario or self.scenario
+        scenario = full_name(scenario or self.scenario)
         spec = PolicySpec.parse(self.policy)
-        own: dict[str, Any] = {"observation": spec.observation, "traffic": self.traffic_on(scenario)}
+        own: dict[str, Any] = {"observation": spec.observation, "traffic": self.crowds_on(scenario)}
         own["config"] = self.sim
         own |= {name: value for name, value in vars(spec).items() if name not in ("hidden", "features")}
         own |= dict.fromkeys(spec.features, True)
@@ -144,7 +145,10 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         if meta.get("sim_format", 1) == 1:
             sim = _in_seconds(sim)
         config = SimConfig.of(sim)
-        return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
+        traffic = meta.get("traffic", 0)
+        return Champion(
+            genome, str(spec), str(meta["scenario"]), config, traffic if traffic in AMOUNTS else int(traffic)
+        )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
 
@@ -173,37 +177,48 @@ def evaluate(
     scenario: str | None = None,
     episodes: int = 64,
     seed: int = HELD_OUT_SEED,
-    traffic: int | None = None,
+    traffic: Traffic | None = None,
     sim: SimConfig | str | None = None,
 ) -> dict[str, float]:
     """Drive a champion through episodes on maps it never saw, in this process.
 
-    Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed; other cars on the
-    road (default: as many as it learned among, or as the other scenario has by default); what `SimConfig.load` takes,
-    in place of the simulator's numbers that it learned with.
+    Args: a scenario's name (default: the champion's own), also of several roads; how many episodes on each road; the
+    first map's seed; other cars, usual, heavy or a number (default: as many as it learned among, or as another
+    scenario has by default); what `SimConfig.load` takes, in place of the simulator's numbers that it learned with.
     Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means), km_per_collision. With the defaults
     these are the held-out figures of summary.json.
     Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.
     """
     champion = champion.in_sim(sim)
-    chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
+    found = [results for _, _, results in drives(champion, scenario, episodes, seed, traffic)]
+    return summarise(np.concatenate(found), champion.sim.episode.control_period)
+
+
+def drives(
+    champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: Traffic | None
+) -> Iterator[tuple[str, int, np.ndarray]]:
+    """The drives of `evaluate`, road by road. Yields: the road, the number of other cars, and RESULT [episodes]."""
     spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
-    results = rollout.evaluate(spec, genomes, roads, chosen.rows, sim, chosen.worlds)[0]
-    return summarise(results[0], sim.episode.control_period)
+    for road, cars, chosen, maps in held_out(champion, scenario, episodes, seed, traffic):
+        yield road, cars, rollout.evaluate(spec, genomes, maps, chosen.rows, sim, chosen.worlds)[0][0]
 
 
 def held_out(
-    champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: int | None
-) -> tuple[Episodes, list[Map]]:
-    """The episodes that `evaluate` drives, and their maps. Raises: GridSimError as it does."""
-    name = scenario or champion.scenario
+    champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: Traffic | None
+) -> Iterator[tuple[str, int, Episodes, list[Map]]]:
+    """The episodes that `evaluate` drives, road by road. Yields: the road, other cars, episodes, and their maps.
+
+    Raises: GridSimError as it does.
+    """
+    name = full_name(scenario or champion.scenario)
+    check_name(name)
     if episodes < 1:
         raise GridSimError(f"episodes must be 1 or more, not {episodes}")
-    traffic = champion.traffic_on(name) if traffic is None else traffic
-    if not 0 <= traffic <= MAX_TRAFFIC:
-        raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     seeds = range(seed, seed + max(len(HELD_OUT_SEEDS), episodes // 8))
-    same = {k: seed_of_map(name, k) for k in seeds}
-    roads = {k: build(name, k, champion.sim) for k in dict.fromkeys(same.values())}
-    chosen = spread_starts(lambda k: roads[same[k]], seeds, episodes, traffic, champion.sim)
-    return chosen, [roads[same[k]] for k in chosen.maps]
+    for road, cars in zip(roads_of(name), champion.crowds_on(name, traffic), strict=True):
+        if not 0 <= cars <= MAX_TRAFFIC:
+            raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {cars}")
+        same = {k: seed_of_map(road, k) for k in seeds}
+        maps = {k: build(road, k, champion.sim) for k in dict.fromkeys(same.values())}
+        chosen = spread_starts(lambda k: maps[same[k]], seeds, episodes, (cars,), champion.sim)  # noqa: B023
+        yield road, cars, chosen, [maps[same[k]] for k in chosen.maps]

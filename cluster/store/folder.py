@@ -26,7 +26,6 @@ from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, ELITES, HISTO
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.parts import is_map_file
 from gridsim.maps.scenarios import label, map_digest
 from gridsim.packages import DISTRIBUTION
 
@@ -107,8 +106,8 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
 def _sources(settings: RunSettings) -> dict[str, str]:
     """Digests of the user's files that a run depends on: its map's and its fitness's. Raises GridSimError."""
     found = {}
-    if is_map_file(settings.scenario):
-        found["map_sha256"] = map_digest(settings.scenario)
+    if digest := map_digest(settings.scenario):
+        found["map_sha256"] = digest
     if isinstance(settings, EvolveSettings) and settings.fitness:
         found["fitness_sha256"] = fitness.digest(settings.fitness)
     return found

@@ -15,12 +15,13 @@ from typing import Any
 from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store.champion import load_champion
 from cluster.store.folder import FILES
-from cluster.text import km_per_collision
+from cluster.text import cars, km_per_collision
 from cluster.tracking.address import TrackingError
 from cluster.tracking.content import CHAMPION_TAG, Content, Model
 from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
+from gridsim.maps.parts import roads_of
 from gridsim.maps.scenarios import label
 
 NOT_LOGGED = ("target_m",)  # columns of history.csv that are not metrics
@@ -41,7 +42,7 @@ def read_run(folder: Path) -> Content | None:
         summary = json.loads(path.read_bytes()) if path.is_file() else None
         model = None
         if summary:
-            held_out, step, wall_s = held_out_metrics(summary["held_out"]), len(rows), float(summary["wall_s"])
+            held_out, step, wall_s = held_out_metrics(summary), len(rows), float(summary["wall_s"])
             # The last candidate is validated after the last step.
             last = {"validation/success_rate": float(summary["validation_success_rate"])}
             rows += [(step - 1, held_out, wall_s), (step, last, wall_s)]
@@ -82,7 +83,7 @@ def read_rows(path: Path) -> list[tuple[int, Mapping[str, float], float]]:
 def group(settings: RunSettings) -> str:
     """What runs that differ only in their seeds have in common, in words."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
-    words += [f"{settings.traffic} cars"] if settings.traffic else []
+    words += [cars(settings.traffic)] if settings.traffic else []
     given = asdict(settings)
     usual = asdict(type(settings)(settings.scenario, settings.traffic, observation=settings.observation))
     left_out = {"seed", "policy", "actions", "search", *settings.extendable}  # varied, named above, or only limits
@@ -94,27 +95,39 @@ def tags(settings: RunSettings) -> dict[str, str]:
     """What runs are found and grouped by, besides their parameters; `group` is all but the seed."""
     return {
         "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
-        "scenario": settings.scenario,
+        "scenario": settings.scenario if len(roads_of(settings.scenario)) == 1 else label(settings.scenario),
         "group": group(settings),
     }
 
 
-def held_out_metrics(figures: Mapping[str, float]) -> dict[str, float]:
-    """Held-out figures under MLflow's names."""
-    return {f"held_out/{name}": float(value) for name, value in figures.items() if name != "episodes"}
+def held_out_metrics(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Held-out figures under MLflow's names; of several roads also each one's."""
+    roads = {"": summary["held_out"]}
+    if len(by_road := summary.get("held_out_by_road", {})) > 1:
+        roads |= {f"{_plain(road)}/": figures for road, figures in by_road.items()}
+    return {
+        f"held_out/{road}{name}": float(value)
+        for road, figures in roads.items()
+        for name, value in figures.items()
+        if name != "episodes"
+    }
+
+
+def _plain(road: str) -> str:
+    """A road's label as a part of MLflow's names, where an @ would be read as an alias."""
+    return re.sub(r"[^\w.-]", "_", road)
 
 
 def model_name(settings: RunSettings) -> str:
     """The registered model whose versions are the champions of such runs."""
-    road = re.sub(r"[^\w.-]", "_", label(settings.scenario))  # an @ would be read as an alias
-    return f"gridsim-{road}-{settings.algorithm}"
+    return f"gridsim-{_plain(label(settings.scenario))}-{settings.algorithm}"
 
 
 def headline(settings: RunSettings) -> str:
     """What a run does, in one line."""
     verb = {"dqn": "Deep Q-learning", "random": "Random search"}.get(settings.algorithm, "Evolution")
-    cars = f"among {settings.traffic} cars" if settings.traffic else "without traffic"
-    return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {cars}, seed {settings.seed}."
+    among = f"among {cars(settings.traffic)}" if settings.traffic else "without traffic"
+    return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {among}, seed {settings.seed}."
 
 
 def result(folder: Path, settings: RunSettings, summary: Mapping[str, Any]) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 
 from cluster import stopping
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.text import file_name
 from cluster.workers.child import Child
 from cluster.workers.pool import LOOK_S
 from cluster.workers.worker import CollectTask, Task, Worker
@@ -29,9 +30,9 @@ from evolution.search.breeding import Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
 from gridsim.maps.map import blank, sample_starts
-from gridsim.maps.parts import is_map_file
+from gridsim.maps.parts import is_map_file, roads_of
 from gridsim.maps.roads import clearances
-from gridsim.maps.scenarios import REGISTRY, build, default_traffic
+from gridsim.maps.scenarios import REGISTRY, build, label, traffic_on
 from gridsim.sensing.imperfections import imperfections_of
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn
@@ -43,7 +44,7 @@ PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what bui
 def _marker(settings: RunSettings) -> Path:
     """The file whose existence says that all kernels are compiled which such a run needs."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
-    road = "file" if is_map_file(settings.scenario) else settings.scenario
+    road = "file" if is_map_file(settings.scenario) else file_name(label(settings.scenario))
     traffic = "traffic" if settings.traffic else "alone"
     sim = settings.simulator()
     noisy, late = (part is not None for part in imperfections_of(sim))
@@ -67,7 +68,7 @@ def is_compiled(settings: RunSettings) -> bool:
 
 def compile_ahead(settings: RunSettings) -> None:
     """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
-    what = [settings.scenario, settings.sim, settings.policy, str(settings.traffic), settings.command]
+    what = [settings.scenario, settings.sim, settings.policy, str(max(settings.crowds)), settings.command]
     what += [OWN] if has_own(settings) else []
     compilers = list[Child]()
     try:
@@ -100,8 +101,9 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
                 CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
             )
         return
-    built = build(scenario, 0, config)
-    spawn(built.network, sample_starts(built, 1, np.random.default_rng(0)), traffic, keys, config)
+    for seed in range(len(roads_of(scenario))):
+        built = build(scenario, seed, config)
+        spawn(built.network, sample_starts(built, 1, np.random.default_rng(0)), traffic, keys, config)
     _, cars, others = trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
     views(road, cars, others, config)
     clearances(road.road, freeze(cars[:, :2]))
@@ -112,7 +114,7 @@ def everything_by_default() -> list[RunSettings]:
     return [
         kind(scenario=scenario, traffic=traffic, observation=observation)
         for scenario in REGISTRY
-        for traffic in sorted({0, default_traffic(scenario)})
+        for traffic in sorted({0, traffic_on(scenario)})
         for kind in (EvolveSettings, DqnSettings)
         for observation in get_args(Observation)
     ]
@@ -126,7 +128,8 @@ def main(part: str, *what: str) -> None:
         return
     for settings in everything_by_default():
         for each in PARTS:
-            compile_part(each, settings.scenario, settings.sim, settings.policy, settings.traffic, settings.command)
+            cars = max(settings.crowds)
+            compile_part(each, settings.scenario, settings.sim, settings.policy, cars, settings.command)
         _marker(settings).touch()
         print(_marker(settings).name, flush=True)
 

@@ -3,16 +3,16 @@
 Episodes begin short, since at first the best members drive into the first bend at full speed, and their length doubles
 when the leader (the best genome known before a generation) succeeds. Half of them start shortly before a crash of a
 recent leader, mostly where half of the members crash again: there is most to learn. Each group of a generation has its
-own, so that selection uses many although each member drives few.
+own, so that selection uses many although each member drives few. Where there are several roads, they take turns.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.maps.parts import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
-from gridsim.state import LANE, TERMINATES, TRAFFIC_FIELDS, End
+from gridsim.maps.parts import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, road_number, seed_on
+from gridsim.state import TERMINATES, End
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
@@ -49,39 +49,53 @@ class CurriculumConfig:
     first_target: float = 150.0  # m, target of the first episodes
     last_target: float = 400.0  # m, largest target of training; further starts teach as much as longer episodes
     growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
-    pace: float = 7.0  # m/s, mean speed required by a training episode's time limit; seamless's, like champion_pace
+    # Of each road, m/s: mean speed required by a training episode's time limit; seamless's, like champion_pace.
+    pace: tuple[float, ...] = (7.0,)
     slack: float = 3.0  # s, added to that time limit
     promising: float = 0.5  # least success rate of the leader, over `latest` generations, before one is validated
     latest: int = 4  # generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
     validation: int = 256  # episodes of validation
-    champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
+    champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
 def spread_starts(
-    build: Callable[[int], Map], seeds: range, episodes: int, traffic: int, config: SimConfig
+    build: Callable[[int], Map], seeds: range, episodes: int, crowds: Sequence[int], config: SimConfig, room: int = 0
 ) -> Episodes:
-    """Full episodes on the maps of `seeds` in turn; they depend only on the scenario and the arguments."""
-    rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
-    used = np.arange(episodes) % len(seeds)
-    return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic, config))
+    """Full episodes, as many on each road, one road after the other: on its maps of its own `seeds` in turn.
+
+    A road's depend only on the road and the arguments, not on the other roads. Args: other cars on each road; for how
+    many there is `room` in an episode, if that is more.
+    """
+    used, roads = np.arange(episodes) % len(seeds), list[Episodes]()
+    for k, traffic in enumerate(crowds):
+        rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
+        maps = [seed_on(k, len(crowds), seed) for seed in seeds]
+        starts = lane_starts([build(seed) for seed in maps], used, rng, traffic, config, max(room, *crowds))
+        roads.append(Episodes(maps, *starts))
+    return reduce(Episodes.and_then, roads)
 
 
 class Curriculum:
     """The curriculum of one run: its target, crashes, training maps and validation."""
 
     def __init__(
-        self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], sim: SimConfig, traffic: int = 0
-    ):
+        self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], sim: SimConfig,
+        crowds: Sequence[int] = (0,),
+    ):  # fmt: skip
+        """Args: other cars on each road."""
         self.config, self.seed, self.build, self.sim = config, seed, build, sim
-        self.traffic, self.crowd = traffic, round(config.crowd * traffic)
+        self.roads, self.crowds = len(crowds), crowds
+        self.training_crowds = [round(config.crowd * cars) for cars in crowds]
         self.goal, self.period = sim.episode.target, sim.episode.control_period
         self.target = min(config.first_target, self.goal)
         self.crashes, self.crash_worlds = self._starts([], np.zeros(0, dtype=int), np.random.default_rng(0))
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: dict[range, Episodes] = {}
         rng, seeds = np.random.default_rng(np.random.SeedSequence([seed, 11])), VALIDATION_SEED - TRAINING_SEED
-        self.map_seeds: list[int] = (TRAINING_SEED + rng.choice(seeds, config.maps, replace=False)).tolist()
+        own = TRAINING_SEED + rng.choice(seeds // self.roads, config.maps, replace=False)
+        # The k-th training map is of road k modulo the number of roads.
+        self.map_seeds = [seed_on(k % self.roads, self.roads, each) for k, each in enumerate(own.tolist())]
 
     def _rng(self, generation: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
@@ -90,21 +104,32 @@ class Curriculum:
         self, seeds: Sequence[int], maps: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Episodes and their traffic, of training, on maps [e] that index `seeds`."""
-        return lane_starts([self.build(seed) for seed in seeds], maps, rng, self.crowd, self.sim)
+        cars, room = [self.training_crowds[road_number(seed, self.roads)] for seed in seeds], max(self.training_crowds)
+        return lane_starts([self.build(seed) for seed in seeds], maps, rng, cars, self.sim, room)
 
     def maps_in_use(self, generation: int) -> int:
         """Number of training maps in use."""
         return min(self.config.maps, self.config.first_maps + generation)
 
-    def _limit(self, episodes: np.ndarray, target: float) -> None:
-        """Set the target (m) of training episodes EPISODE [e], and the time limit that follows from it."""
-        episodes["target"] = target
-        episodes["steps"] = math.ceil((target / self.config.pace + self.config.slack) / self.period)
+    def _limit(self, episodes: np.ndarray, seeds: Sequence[int], target: float) -> None:
+        """Set the target (m) of training episodes EPISODE [e], and the time limit that follows from it on their roads.
 
-    def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Training maps [count] as indices into `map_seeds`; without repetition if there are enough."""
-        n = self.maps_in_use(generation)
-        return rng.choice(n, count, replace=count > n)
+        Args: seeds of the maps that the episodes index.
+        """
+        pace = np.array(self.config.pace)[[road_number(seeds[m], self.roads) for m in episodes["map"]]]
+        episodes["target"] = target
+        episodes["steps"] = np.ceil((target / pace + self.config.slack) / self.period)
+
+    def _some_maps(self, generation: int, count: int, rng: np.random.Generator, first: int) -> np.ndarray:
+        """Training maps [count] as indices into `map_seeds`; without repetition if there are enough.
+
+        They are of the roads in turn, from number `first` on.
+        """
+        roads, maps = (first + np.arange(count)) % self.roads, np.empty(count, dtype=np.int64)
+        for road in np.unique(roads):
+            n, of = len(range(road, self.maps_in_use(generation), self.roads)), roads == road
+            maps[of] = road + self.roads * rng.choice(n, of.sum(), replace=of.sum() > n)
+        return maps
 
     def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
         """Episodes with new starts on training maps [e]."""
@@ -115,14 +140,16 @@ class Curriculum:
     def episodes(self, generation: int) -> Episodes:
         """A generation's episodes, group by group: first new starts, then crash starts, as many in each group."""
         config, rng = self.config, self._rng(generation, 0)
-        maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
+        # Where a group has too few episodes for all roads, others of the generation, and its next ones, have the rest.
+        firsts = [(generation + group) * config.starts for group in range(config.groups)]
+        maps = [self._some_maps(generation, config.starts, rng, first) for first in firsts]
         fresh = self._new_starts(np.concatenate(maps), rng)
-        self._limit(fresh.rows, self.target)
+        self._limit(fresh.rows, fresh.maps, self.target)
         if not len(self.crashes) or not config.crash_starts:
             return fresh
         chosen = self._choose_crashes(generation)
         crashes = self.crashes[chosen]
-        self._limit(crashes, min(config.crash_target, self.target))
+        self._limit(crashes, self.map_seeds, min(config.crash_target, self.target))
         seeds = [self.map_seeds[m] for m in crashes["map"]]
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
@@ -156,12 +183,12 @@ class Curriculum:
     def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
         """`count` new full episodes on the training maps, by default for the DQN's batches."""
         rng = self._rng(batch, purpose)
-        return self._new_starts(self._some_maps(batch, count, rng), rng)
+        return self._new_starts(self._some_maps(batch, count, rng, batch * count), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
         """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
         episodes = self.starts(generation, self.config.leader_episodes, purpose=2)
-        self._limit(episodes.rows, min(self.config.leader_stretch * self.target, self.goal))
+        self._limit(episodes.rows, episodes.maps, min(self.config.leader_stretch * self.target, self.goal))
         episodes.rows["rewind"] = self.config.rewind
         return episodes
 
@@ -189,20 +216,22 @@ class Curriculum:
     def validation(self, seeds: range = VALIDATION_SEEDS) -> Episodes:
         """Validation's episodes on maps of `seeds`, the same for all runs of a scenario with the same traffic.
 
-        They share a task with a generation's episodes, so their worlds are padded with absent cars to the same size.
+        They share a task with a generation's episodes, so there is room for as many cars.
         """
         if seeds not in self._validation:
-            maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic, self.sim)
-            absent = np.zeros((len(rows), self.crowd - self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
-            absent[:, :, LANE] = -1.0
-            self._validation[seeds] = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
+            episodes, room = self.config.validation, max(self.training_crowds)
+            self._validation[seeds] = spread_starts(self.build, seeds, episodes, self.crowds, self.sim, room)
         return self._validation[seeds]
 
-    def validation_score(self, results: np.ndarray) -> np.ndarray:
-        """Scores in [0, 1] of members from validation's results [n, e]: success rate, reduced below champion_pace."""
-        metres = results["distance"].astype(np.float64).sum(axis=1)
-        speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
-        return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
+    def validation_scores(self, results: np.ndarray) -> np.ndarray:
+        """Scores in [0, 1] on each road, float64 [roads], from a member's results in validation, RESULT [e].
+
+        They are success rates, reduced below champion_pace.
+        """
+        on_each = results.reshape(self.roads, -1)
+        metres = on_each["distance"].astype(np.float64).sum(axis=1)
+        speed = metres / np.maximum(on_each["steps"].sum(axis=1) * self.period, 1e-9)
+        return success_rate(on_each) * np.minimum(speed / np.array(self.config.champion_pace), 1.0)
 
 
 def success_rate(results: np.ndarray) -> np.ndarray:

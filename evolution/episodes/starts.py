@@ -10,7 +10,7 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
-from gridsim.state import POSE, TRAFFIC_FIELDS
+from gridsim.state import LANE, POSE, TRAFFIC_FIELDS
 from gridsim.traffic.world import spawn
 
 
@@ -34,23 +34,29 @@ def lane_starts(
     road_maps: Sequence[Map],
     maps: np.ndarray,
     rng: np.random.Generator,
-    traffic: int = 0,
+    traffic: int | Sequence[int] = 0,
     config: SimConfig | None = None,
+    room: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
     They have the configuration's target and time limit.
-    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, TRAFFIC_FIELDS]).
+    Args: other cars, the same number on all maps or one for each; for how many there is `room`, if that is more: the
+    others are absent (LANE is -1).
+    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), cars, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()
     episodes = np.zeros(len(maps), dtype=EPISODE)
-    worlds = np.zeros((len(maps), traffic, TRAFFIC_FIELDS), dtype=np.float32)
+    cars = np.broadcast_to(traffic, len(road_maps)).tolist()
+    room = max([room, *cars])
+    worlds = np.zeros((len(maps), room, TRAFFIC_FIELDS), dtype=np.float32)
+    worlds[:, :, LANE] = -1.0
     episodes["map"], episodes["target"], episodes["steps"] = maps, config.episode.target, config.episode.steps
-    on_each = [(road_maps[m], np.flatnonzero(maps == m)) for m in np.unique(maps)]
-    for road_map, of in on_each:
-        episodes["start"][of, :POSE] = sample_starts(road_map, len(of), rng)
-    if traffic:
+    on_each = [(m, np.flatnonzero(maps == m)) for m in np.unique(maps)]
+    for m, of in on_each:
+        episodes["start"][of, :POSE] = sample_starts(road_maps[m], len(of), rng)
+    if room:
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
-        for road_map, of in on_each:
-            worlds[of] = spawn(road_map.network, episodes["start"][of], traffic, keys[of], config)
+        for m, of in on_each:
+            worlds[of, : cars[m]] = spawn(road_maps[m].network, episodes["start"][of], cars[m], keys[of], config)
     return episodes, worlds

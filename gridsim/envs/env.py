@@ -42,7 +42,7 @@ from gridsim.envs.observing import Observer, row
 from gridsim.jit import U
 from gridsim.maps.map import Map
 from gridsim.maps.parts import TRAINING_SEED
-from gridsim.maps.scenarios import check_name, default_traffic, has_lanes
+from gridsim.maps.scenarios import Traffic, check_name, crowds, full_name, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.sensing.observation import OPTIONAL
 from gridsim.sensing.route import points_ahead
@@ -83,7 +83,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         scenario: str = "seamless",
         maps: int | Sequence[Map] = 8,
         map_seed: int = TRAINING_SEED,
-        traffic: int | None = None,
+        traffic: Traffic | tuple[int, ...] | None = None,
         observation: Literal["rays", "grid", "image"] = "rays",
         frames: int = 1,
         actions: Literal["discrete", "continuous"] = "discrete",
@@ -99,7 +99,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first map; the others' seeds follow.
-            traffic: other cars in each car's world; None means the scenario's default.
+            traffic: other cars in each car's world: usual, heavy, a number, or one for each of several roads; None
+                means the scenario's default.
             frames: grids in an observation, 1 to 8.
             render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
                 it only where there is a display.
@@ -108,7 +109,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
             features: which of `motion`, `steering` and `route` rays come with.
         """
-        check_name(scenario)
+        check_name(scenario := full_name(scenario))
         for name, value, known in (
             ("observation", observation, ("rays", "grid", "image")),
             ("actions", actions, ("discrete", "continuous")),
@@ -123,18 +124,18 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         seen = tuple(name for name in OPTIONAL if features.get(name))
         if seen and observation != "rays":
             raise ValueError(f"{' and '.join(seen)}: only for rays; leave them out with observation={observation!r}")
-        if not has_lanes(scenario) and (traffic or "route" in seen):
-            raise ValueError(f"{scenario} has no lanes for traffic or a route; use traffic=0, and not route=True")
         self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
+        cars = traffic if isinstance(traffic, tuple) else crowds(scenario, traffic, self.config)
+        if not has_lanes(scenario) and (any(cars) or "route" in seen):
+            raise ValueError(f"{scenario} has no lanes for traffic or a route; use traffic=0, and not route=True")
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array", "human"] if render_mode == "human" or has_display() else ["rgb_array"],
             "render_fps": 1.0 / self.config.episode.control_period,
             "autoreset_mode": self.autoreset_mode,
         }
-        traffic = default_traffic(scenario, self.config) if traffic is None else traffic
-        self.simulator = Simulator(num_envs, self.config, None, max_episode_steps, traffic, seen)
-        self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
+        self.simulator = Simulator(num_envs, self.config, None, max_episode_steps, max(cars), seen)
+        self._episodes = Episodes(num_envs, scenario, maps, map_seed, cars, self.config)
         self.render_mode = render_mode
         self._views: dict[Map, Renderer] = {}
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures

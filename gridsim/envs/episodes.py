@@ -13,10 +13,10 @@ from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import U, njit
 from gridsim.maps.map import Map, starts_at
-from gridsim.maps.parts import is_map_file, seed_of_map
+from gridsim.maps.parts import is_map_file, road_number, seed_of_map
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
-from gridsim.state import TRAFFIC_FIELDS
+from gridsim.state import LANE, TRAFFIC_FIELDS
 from gridsim.traffic.world import spawn
 
 #: The maps of this process's environments, kept while one of them uses them.
@@ -43,10 +43,14 @@ class Episodes:
     """
 
     def __init__(
-        self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, traffic: int, config: SimConfig
-    ):
-        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed."""
-        self.scenario, self.traffic, self.config = scenario, traffic, config
+        self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, crowds: tuple[int, ...],
+        config: SimConfig,
+    ):  # fmt: skip
+        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed.
+
+        Args: other cars on each of the scenario's roads.
+        """
+        self.scenario, self.crowds, self.config = scenario, crowds, config
         given = [] if isinstance(maps, int) else maps
         if isinstance(maps, int):
             self._seeds = list(dict.fromkeys(seed_of_map(scenario, map_seed + k) for k in range(maps)))
@@ -65,7 +69,7 @@ class Episodes:
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[list[Map], np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and worlds [k, traffic, TRAFFIC_FIELDS] of the episodes of cars `which` [k]."""
+        """Maps [k], starts [k, 5] and worlds [k, cars, TRAFFIC_FIELDS] of the episodes of cars `which` [k]."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -80,15 +84,17 @@ class Episodes:
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)
-        worlds = np.empty((len(which), self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
-        on_each: defaultdict[Map, list[int]] = defaultdict(list)
-        for k, road_map in enumerate(maps):
-            on_each[road_map].append(k)
-        for road_map, of in on_each.items():
+        worlds = np.zeros((len(which), max(self.crowds), TRAFFIC_FIELDS), dtype=np.float32)
+        worlds[:, :, LANE] = -1.0
+        on_each: defaultdict[int, list[int]] = defaultdict(list)
+        for k, seed in enumerate(seeds):
+            on_each[seed].append(k)
+        for seed, of in on_each.items():
+            cars = self.crowds[road_number(seed, len(self.crowds))]
             if start is None:
-                starts[of] = starts_at(road_map, numbers[of, 1])
-            if self.traffic:
-                worlds[of] = spawn(road_map.network, starts[of], self.traffic, keys[of], self.config)
+                starts[of] = starts_at(found[seed], numbers[of, 1])
+            if cars:
+                worlds[of, :cars] = spawn(found[seed].network, starts[of], cars, keys[of], self.config)
         return maps, starts, worlds
 
     def _map(self, seed: int) -> Map:

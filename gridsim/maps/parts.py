@@ -1,13 +1,15 @@
 """Which maps are for training, for the choice of the champion, and for the final report and nothing else.
 
 Maps are asked for by seeds, which are in three parts. A generated road has a new map for each seed; the files of a
-folder are divided among the parts; and on a single file, episodes of each part begin in regions of their own.
+folder are divided among the parts; and on a single file, episodes of each part begin in regions of their own. Where a
+scenario's name lists several roads, these take turns: in each part, the k-th seed of n roads is one of road k modulo n.
 """
 
 from __future__ import annotations
 
 import glob
 import os
+import re
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,13 +24,46 @@ TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_00
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
 YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
+CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)")  # a square of a file: its path, middle and side
 _TURNS = 0, 1, 2, 0, 0  # the parts of files in turn, and of regions along a row
 _REGIONS = 10  # along the longer side of a map
 
 
+def roads_of(name: str) -> list[str]:
+    """The roads that a scenario's name lists, separated by commas, which are also in a CROP and in names of files."""
+    words, roads = [name] if os.path.exists(name) else name.split(","), list[str]()
+    while words:
+        n = 3 if CROP.fullmatch(",".join(words[:3])) else 1
+        roads.append(",".join(words[:n]))
+        del words[:n]
+    return roads
+
+
+def road_number(seed: int, roads: int) -> int:
+    """Which of so many roads the map of a seed is of."""
+    return (seed - FIRST_SEEDS[part_of(seed)]) % roads
+
+
+def seed_on(number: int, roads: int, own: int) -> int:
+    """The seed of the map that a road, of so many, has for its own seed."""
+    first = FIRST_SEEDS[part_of(own)]
+    return first + (own - first) * roads + number
+
+
+def seeds_on(own: range, roads: int) -> range:
+    """The seeds of the maps that so many roads have for a range of their own seeds."""
+    return range(seed_on(0, roads, own.start), seed_on(0, roads, own.stop))
+
+
+def road_of(name: str, seed: int) -> tuple[str, int]:
+    """The road that the map of a seed is of, and its own seed of that map."""
+    roads, first = roads_of(name), FIRST_SEEDS[part_of(seed)]
+    return roads[road_number(seed, len(roads))], first + (seed - first) // len(roads)
+
+
 def is_map_file(name: str) -> bool:
     """Whether a scenario's name is a path: of a map file, of a folder of them, or a pattern such as maps/*.osm."""
-    return names_file(name) or glob.has_magic(name) or os.path.isdir(name)
+    return len(roads_of(name)) == 1 and (names_file(name) or glob.has_magic(name) or os.path.isdir(name))
 
 
 def files_of(name: str) -> list[str]:
@@ -65,6 +100,8 @@ def part_of(seed: int) -> int:
 
 def seed_of_map(name: str, seed: int) -> int:
     """The smallest seed of the map that a seed has: that seed itself for generated roads."""
+    if (roads := len(roads_of(name))) > 1:
+        return seed_on(road_number(seed, roads), roads, seed_of_map(*road_of(name, seed)))
     if not is_map_file(name):
         return seed
     part = part_of(seed)
@@ -111,6 +148,8 @@ def _regions(road_map: Map) -> np.ndarray | None:
 
 def held_out_place(name: str, held_out: Map) -> str:
     """Where the drives of the final report are, in words, given one of its maps."""
+    if (roads := len(roads_of(name))) > 1:
+        return f"held-out drives of {roads} roads"
     if not is_map_file(name):
         return "held-out drives"
     files = [Path(file).name for file in divided(name)[2]]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
 import glob
 import hashlib
+import os
 import re
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -18,10 +21,25 @@ from gridsim.maps import generators
 from gridsim.maps.lanes import Scenario
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.parts import PICTURES, YAMLS, file_of, files_of, is_map_file, seed_of_map, seeds_of_files, with_seed
+from gridsim.maps.parts import (
+    PICTURES,
+    YAMLS,
+    file_of,
+    files_of,
+    is_map_file,
+    road_of,
+    roads_of,
+    seed_of_map,
+    seeds_of_files,
+    with_seed,
+)
 from gridsim.maps.roads import clearance_nodes, make_road
 
+ALL = "all"  # the name of all roads of the registry
 REAL_TRAFFIC = 8  # default number of other cars on real roads
+Amount = Literal["usual", "heavy"]
+AMOUNTS: tuple[str, ...] = get_args(Amount)
+Traffic = int | Amount  # as users ask for it
 
 _FOUND = {
     file.name: import_module(f"{generators.__name__}.{file.name}").SCENARIO
@@ -33,22 +51,40 @@ REGISTRY: dict[str, Scenario] = dict(
 )
 
 
+def full_name(name: str) -> str:
+    """A scenario's name that means the same in another folder: paths are absolute, and `all` is the registry."""
+    roads = [road for each in roads_of(name) for road in (REGISTRY if each == ALL else [each])]
+    return ",".join(os.path.abspath(road) if is_map_file(road) else road for road in roads)
+
+
 def has_lanes(name: str) -> bool:
-    """Whether a scenario has lanes, and so may have traffic: all but pictures and YAML files."""
-    if not is_map_file(name):
-        return True
-    return all(Path(file).suffix.lower() not in PICTURES + YAMLS for file in files_of(name))
+    """Whether all roads of a scenario have lanes, and so may have traffic: all but pictures and YAML files."""
+    files = [file for road in roads_of(name) if is_map_file(road) for file in files_of(road)]
+    return all(Path(file).suffix.lower() not in PICTURES + YAMLS for file in files)
 
 
 def check_name(name: str) -> None:
-    """Raises: GridSimError if the name is neither in the registry nor a map file's."""
-    if name not in REGISTRY and not is_map_file(name):
-        names = ", ".join(sorted(REGISTRY))
-        raise GridSimError(f"unknown scenario {name!r}; there are: {names}, and files of maps and roads")
+    """Raises: GridSimError if one of the roads is neither in the registry nor a map file, or is named twice."""
+    roads = roads_of(name)
+    if not all(roads):
+        raise GridSimError(f"scenario {name!r}: the name of a road is empty")
+    for road in roads:
+        if road not in REGISTRY and not is_map_file(road):
+            like = difflib.get_close_matches(road, REGISTRY, 1)
+            hint = f"did you mean {like[0]}? There" if like else "there"
+            names = ", ".join(sorted(REGISTRY))
+            raise GridSimError(f"unknown scenario {road!r}; {hint} are: {names}, {ALL}, and files of maps and roads")
+    labels = [label(road) for road in roads]
+    for road, short in zip(roads, labels, strict=True):
+        if labels.count(short) > 1:
+            raise GridSimError(f"scenario {name}: {road if roads.count(road) > 1 else short} is there twice")
 
 
 def label(name: str) -> str:
     """A short name of a scenario: for a file, its name without what says its format."""
+    if len(roads := roads_of(name)) > 1:
+        every = {*REGISTRY} <= {*roads}
+        return "+".join([ALL] * every + [label(road) for road in roads if not (every and road in REGISTRY)])
     if not is_map_file(name):
         return name
     if glob.has_magic(name) and not Path(name).exists():
@@ -57,23 +93,41 @@ def label(name: str) -> str:
 
 
 def map_digest(name: str) -> str:
-    """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
+    """SHA-256 of the files of a scenario's maps; "" without any. Raises: GridSimError if they cannot be read."""
     from gridsim.maps import files
     from gridsim.maps.real.load import file_digest
 
-    digests = [(file_digest if has_lanes(file) else files.map_digest)(file) for file in files_of(name)]
-    return digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest()
+    names = [file for road in roads_of(name) if is_map_file(road) for file in files_of(road)]
+    digests = [(file_digest if has_lanes(file) else files.map_digest)(file) for file in names]
+    return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else "".join(digests)
 
 
-def default_traffic(name: str, config: SimConfig | None = None) -> int:
-    """A scenario's default number of other cars; 0 on a map without lanes, and for small cars."""
+def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> int:
+    """The number of other cars on a road: a number that is asked for, `usual`, `heavy` or None, the default.
+
+    Without a number there are none on a map without lanes, and for small cars. Raises: GridSimError for another word.
+    """
+    if type(asked) is int:
+        return asked
+    if asked not in (None, *AMOUNTS):
+        raise GridSimError(f"traffic is {', '.join(AMOUNTS)} or a number of cars, not {asked!r}")
     if not has_lanes(name) or (config is not None and config.unit < 1.0):
         return 0
-    return REGISTRY[name].traffic if name in REGISTRY else REAL_TRAFFIC
+    cars = REGISTRY[name].traffic if name in REGISTRY else REAL_TRAFFIC
+    if asked and not cars:
+        cars = REGISTRY[name].usual_traffic
+    return 2 * cars if asked == "heavy" else cars
+
+
+def crowds(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> tuple[int, ...]:
+    """The number of other cars on each road of a scenario, as `traffic_on`; that of several is by default `usual`."""
+    roads = roads_of(name)
+    asked = "usual" if asked is None and len(roads) > 1 else asked
+    return tuple(traffic_on(road, asked, config) for road in roads)
 
 
 def speed_interval(name: str, config: SimConfig) -> tuple[float, float]:
-    """A scenario's speed interval, m/s."""
+    """A road's speed interval, m/s."""
     if name in REGISTRY:
         low, high = REGISTRY[name].speed_interval
         return low * config.pace, high * config.pace
@@ -96,6 +150,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     check_name(name)
     if seed < 0:
         raise GridSimError(f"a seed must be 0 or more, not {seed}")
+    name, seed = road_of(name, seed)
     if is_map_file(name):  # imported here, because workers never read files
         from gridsim.maps.files import load_map
         from gridsim.maps.real.load import load_road

@@ -99,7 +99,7 @@ def test_a_run_of_pedal_and_wheel_is_kept_continued_and_refused_as_a_start_for_a
 )
 def test_traffic_is_the_champions_the_roads_or_what_is_asked_for(champion, scenario, traffic, cars):
     used_to_two = dataclasses.replace(champion, traffic=2)
-    episodes, _ = held_out(used_to_two, scenario, 1, 0, traffic)
+    ((_, _, episodes, _),) = held_out(used_to_two, scenario, 1, 0, traffic)
     assert episodes.worlds.shape[1] == cars
     asked = {} if traffic is None else {"traffic": traffic}
     env = used_to_two.make_env(scenario, **asked)
@@ -235,7 +235,7 @@ def test_a_champion_learns_validates_and_is_measured_with_its_own_car(own_sim, t
     own_sim.unlink()
     again = load_champion(tmp_path / "champion.npz")
     assert again.sim == champion.sim
-    chosen, _ = held_out(again, None, 8, 2_000_000, None)
+    ((_, _, chosen, _),) = held_out(again, None, 8, 2_000_000, None)
     assert set(chosen.rows["target"]) == {30.0}
     assert again.make_env().unwrapped.cars.config == champion.sim
     assert evaluate(again, episodes=8, sim="default") != evaluate(again, episodes=8)

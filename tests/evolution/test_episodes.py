@@ -351,7 +351,7 @@ TASK = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2
 
 @pytest.fixture
 def curriculum():
-    return Curriculum(TASK, 7, lambda seed: build("seamless", seed), CONFIG, traffic=2)
+    return Curriculum(TASK, 7, lambda seed: build("seamless", seed), CONFIG, (2,))
 
 
 def test_full_episodes_are_those_of_the_runs_simulator():
@@ -359,8 +359,8 @@ def test_full_episodes_are_those_of_the_runs_simulator():
     own = Curriculum(TASK, 7, lambda seed: build("seamless", seed), sim)
     for full in (own.starts(0, 4), own.validation(range(2))):
         assert {(row["target"], row["steps"]) for row in full.rows} == {(30.0, 400)}
-    own._limit(full.rows, 14.0)
-    assert set(full.rows["steps"]) == {math.ceil((14.0 / TASK.pace + TASK.slack) / 0.05)}
+    own._limit(full.rows, full.maps, 14.0)
+    assert set(full.rows["steps"]) == {math.ceil((14.0 / TASK.pace[0] + TASK.slack) / 0.05)}
 
 
 def led(curriculum, generation, ends, distance=0.0, steps=50):
@@ -376,9 +376,10 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
 @pytest.mark.parametrize(("pace", "share"), [(0.5, 0.5), (1.0, 1.0), (2.0, 1.0)])
 def test_a_validation_score_is_the_success_rate_and_less_for_slow_drivers_only(curriculum, pace, share):
     results = np.zeros((2, 4), dtype=RESULT)
-    results["steps"], results["distance"] = 100, 100 * curriculum.period * pace * TASK.champion_pace
+    results["steps"], results["distance"] = 100, 100 * curriculum.period * pace * TASK.champion_pace[0]
     results["end"] = [[End.SUCCESS] * 4, [End.SUCCESS, End.COLLISION, End.TIME, End.SUCCESS]]
-    assert curriculum.validation_score(results) == pytest.approx([share, share / 2])
+    scores = [float(curriculum.validation_scores(each)[0]) for each in results]
+    assert scores == pytest.approx([share, share / 2])
 
 
 def test_only_who_crashed_or_stood_still_on_the_way_is_remembered(curriculum):

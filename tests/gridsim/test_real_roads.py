@@ -15,7 +15,7 @@ from gridsim.errors import GridSimError
 from gridsim.jit import njit
 from gridsim.maps.real import content, load, sumo
 from gridsim.maps.roads import clearances
-from gridsim.maps.scenarios import build, default_traffic, label
+from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
 from gridsim.state import COS, DISTANCE, LANE, SHIFT, SIN, SPEED, X, Y
 from gridsim.traffic.behaviour import drivers, step_traffic
@@ -201,7 +201,7 @@ def test_cache_gives_the_same_map_without_netconvert(tmp_path, monkeypatch):
     assert again is not first
     assert pickle.dumps(again.network) == pickle.dumps(first.network)
     assert np.array_equal(again.road.field, first.road.field)
-    assert (label(name), default_traffic(name)) == ("a 'street'", 8)
+    assert (label(name), traffic_on(name)) == ("a 'street'", 8)
 
 
 def test_crop(tmp_path):

@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import math
 import os
-import re
 import tempfile
 import zipfile
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from gridsim.errors import GridSimError
 from gridsim.jit import CACHE_FOLDER, F, freeze
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network, make_network
+from gridsim.maps.parts import CROP
 from gridsim.maps.raster import HALF_WALL, OUTSIDE
 from gridsim.maps.real import ends, select
 from gridsim.maps.real.area import clearance_of
@@ -176,7 +176,7 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
 
 def split_crop(name: str) -> tuple[Path, tuple[float, float, float] | None]:
     """The path of a scenario's name, and its crop: FILE@LAT,LON,METRES or FILE@X,Y,METRES."""
-    found = re.fullmatch(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)", name)
+    found = CROP.fullmatch(name)
     try:
         crop = tuple(map(float, found.groups()[1:])) if found else None
     except ValueError:
