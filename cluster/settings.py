@@ -148,13 +148,13 @@ class RunSettings(ABC):
         _check_types(type(self), vars(self))
         check_name(self.scenario)
         sim, roads = self.simulator(), roads_of(self.scenario)
-        (low, high), *_ = [speed_interval(road, sim) for road in roads]  # reads all files
         if not all(0 <= cars <= MAX_TRAFFIC for cars in self.crowds):
             raise GridSimError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
         if any(self.crowds) and (without := [road for road in roads if not has_lanes(road)]):
             remedy = "use --traffic 0" + (", or leave it out of --scenario" if len(roads) > 1 else "")
             raise GridSimError(f"--traffic {self.traffic}: {without[0]} has no lanes for traffic; {remedy}")
         check_traffic(max(self.crowds), sim)
+        (low, high), *_ = [speed_interval(road, sim) for road in roads]  # reads all files
         self._check_range(0, (1 << 63) - 1, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
