@@ -36,6 +36,7 @@ TUTORIALS = {
         "gridsim-evaluate runs/first --episodes 256": "--episodes 4",
         "gridsim-evaluate runs/first --scenario seamless --episodes 256": "--episodes 4",
         "gridsim-evolve --name second": SMALL,
+        "gridsim-evolve --name third --scenario all": "--population 16 --car-steps 3000",
     },
     "docs/paper.md": {
         "gridsim-evolve --policy mlp:6,7 --recombination two": f"{SMALL} --name paper",

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from commands import CHAMPION, call, refused, summary
-from learners import Untracked
+from learners import Untracked, pool_of
 
 import gridsim
 from cluster import run as module
@@ -46,7 +46,7 @@ ROADS = list(REGISTRY)
 @pytest.fixture(scope="module")
 def learning():
     with contextlib.closing(Maps(SETTINGS.scenario, SETTINGS.simulator())) as maps:
-        yield Evolution(SETTINGS, None, maps)
+        yield Evolution(SETTINGS, pool_of(maps), maps)
 
 
 def roads_of_episodes(episodes):

@@ -67,7 +67,7 @@ def test_roads_take_turns_in_each_part():
             assert seed_on(k % 5, 5, own) == first + k == seed_of_map(ALL, first + k)
     assert seeds_on(range(1_000_002, 1_000_004), 5) == range(1_000_010, 1_000_020)
     here, alone = build("highway,curved", 3), build("curved", 1)
-    assert (here.name, here.seed, here.road.speed_low) == ("curved", 1, 6.0)
+    assert (here.name, here.seed, float(here.road.speed_low)) == ("curved", 1, 6.0)
     assert here.network.points.tobytes() == alone.network.points.tobytes()
 
 
@@ -105,7 +105,7 @@ def test_traffic_is_a_number_or_follows_from_the_road(name, asked, cars):
     assert crowds(name, asked) == cars
     assert not any(crowds(name, "usual", SimConfig.load("f1tenth")))
     with pytest.raises(GridSimError, match="usual, heavy or a number of cars, not 'dense'"):
-        crowds(name, "dense")
+        crowds(name, "dense")  # type: ignore[arg-type]
 
 
 def test_environments_drive_on_several_roads_among_each_ones_traffic(tmp_path):
