@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, g
 import tyro
 
 from cluster import fitness
-from evolution.episodes.curriculum import CurriculumConfig
+from evolution.episodes.curriculum import IN_TRAFFIC, CurriculumConfig
 from evolution.episodes.rollout import policy_buffers
 from evolution.networks.policy import CONTINUOUS, Actions, Observation, PolicySpec
 from evolution.search.base import SearchConfig
@@ -117,7 +117,8 @@ class RunSettings(ABC):
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: it suits its roads, the car's size, and traffic if there is any."""
-        sim, usual, roads = self.simulator(), CurriculumConfig(), roads_of(self.scenario)
+        special = IN_TRAFFIC if any(self.crowds) else {}
+        sim, roads, usual = self.simulator(), roads_of(self.scenario), CurriculumConfig(**special)
         lows = [speed_interval(road, sim)[0] for road in roads]
         above = [(0.8, 0.3) if cars else (2.0, 0.85) for cars in self.crowds]
         pace, champion_pace = (
@@ -125,14 +126,11 @@ class RunSettings(ABC):
         )
         if self.pace:
             pace, champion_pace = (self.pace + 1.15 * sim.pace,), (self.pace,)
-        # In traffic, chance matters more: it takes more episodes to see how well a network drives.
-        episodes = 3 if self.traffic else 1
         metres = {name: getattr(usual, name) * sim.unit for name in ("crash_target", "first_target", "last_target")}
         rewind = max(round(usual.rewind * 0.1 * sim.pace / sim.episode.control_period), 1)  # of usual steps of 0.1 s
         return replace(
             usual, pace=pace, champion_pace=champion_pace, first_maps=usual.first_maps * len(roads),
-            starts=episodes, crash_starts=episodes, **metres,
-            rewind=rewind, slack=usual.slack * sim.pace,
+            **metres, rewind=rewind, slack=usual.slack * sim.pace,
         )  # fmt: skip
 
     def extending(self, base: RunSettings) -> Self:
@@ -197,12 +195,12 @@ class EvolveSettings(RunSettings):
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
     +steering to see its own steering angle, +route to see where a route leads that it has to follow; by default
-    mlp:64+steering, in traffic mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of
+    mlp:64+steering, in traffic mlp:128+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of
     two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
-    """Members of a generation; by default 256, in traffic 128, where each drives more episodes."""
+    """Members of a generation; by default 256."""
     generations: Annotated[int, IN_WORDS] = 0
     """Generations at most; by default any number. A run whose champion reaches --until stops earlier."""
     recombination: Literal["all", "two"] = "all"
@@ -230,10 +228,10 @@ class EvolveSettings(RunSettings):
 
     def defaults(self) -> dict[str, Any]:
         alone = not any(self.crowds)
-        rays = "mlp:64+steering" if alone else "mlp:64+motion+steering"
+        rays = "mlp:64+steering" if alone else "mlp:128+motion+steering"
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
-            "population": SearchConfig.population if alone else 128,
+            "population": SearchConfig.population,
             "car_steps": 0 if self.generations else 60_000_000,
         }
 

@@ -59,6 +59,13 @@ class CurriculumConfig:
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
+# What differs in traffic, where crashes become rare long before the search has nothing left to learn from them: most
+# episodes start before a crash, of many, and early enough before it that the car can still avoid it in several ways.
+IN_TRAFFIC = {
+    "starts": 1, "crash_starts": 8, "crash_target": 150.0, "crash_memory": 512, "rewind": 64, "leader_episodes": 64
+}  # fmt: skip
+
+
 def spread_starts(
     build: Callable[[int], Map], seeds: range, episodes: int, crowds: Sequence[int], config: SimConfig, room: int = 0
 ) -> Episodes:

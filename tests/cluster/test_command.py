@@ -42,7 +42,7 @@ def test_help_fills_its_lines_has_an_example_and_says_in_words_what_happens_by_d
     assert lines[0] == f"usage: {prog} [-h] [OPTIONS]{without_flag.get(prog, '')}"
     assert 72 <= max(map(len, lines)) <= 80
     assert f"Example: {prog} " in shown[1000]
-    defaults = dict(re.findall(r"--(\w[\w-]*) .*\(default: (.*?)\)", shown[1000]))
+    defaults = dict(re.findall(r"--(\w[\w-]*) [^│]*\(default: (.*?)\)", shown[1000]))
     assert len(defaults) >= 2
     for group in ("learning", "work", "run") if prog in ("gridsim-evolve", "gridsim-dqn") else ():
         assert f" {group} options " in shown[1000]
@@ -123,7 +123,7 @@ def test_more_workers_than_cores_can_use_are_told_of(monkeypatch, capsys):
 
 POLICIES = {
     "mlp:64+steering": EvolveSettings("city", traffic=0),
-    "mlp:64+motion+steering": EvolveSettings("curved", traffic=2),
+    "mlp:128+motion+steering": EvolveSettings("curved", traffic=2),
     "cnn:8,16,32@1": EvolveSettings("city", observation="grid"),
     "mlp:5": EvolveSettings("city", policy="mlp:5"),
     "mlp:64+steering+continuous": EvolveSettings(actions="continuous"),

@@ -58,7 +58,7 @@ def test_settings_of_several_roads_have_usual_traffic_and_the_network_for_it():
     assert (SETTINGS.scenario, SETTINGS.traffic, SETTINGS.policy) == (
         ",".join(ROADS),
         "usual",
-        "mlp:64+motion+steering",
+        "mlp:128+motion+steering",
     )
     alone = [EvolveSettings(road, "usual", population=64).curriculum() for road in ROADS]
     assert SETTINGS.curriculum().pace == tuple(each.pace[0] for each in alone)
@@ -73,16 +73,17 @@ def test_training_meets_all_roads_alike(learning):
     assert {road_of(SETTINGS.scenario, seed)[0] for seed in curriculum.map_seeds[: curriculum.maps_in_use(0)]} == {
         *ROADS
     }
-    met = np.zeros((config.groups, len(ROADS)), dtype=int)
+    met, limits = np.zeros((config.groups, len(ROADS)), dtype=int), {road: set() for road in range(len(ROADS))}
     for generation in range(len(ROADS)):
         episodes = curriculum.episodes(generation)
         roads = roads_of_episodes(episodes).reshape(config.groups, config.starts)
         counts = np.bincount(roads.ravel(), minlength=len(ROADS))
         assert counts.max() - counts.min() <= 1
+        for road in range(len(ROADS)):
+            limits[road] |= set(episodes.rows["steps"][roads.ravel() == road])
         for group, own in enumerate(roads):
             met[group] += np.bincount(own, minlength=len(ROADS))
     assert met.min() == met.max() == config.starts
-    limits = {road: set(episodes.rows["steps"][roads.ravel() == road]) for road in range(len(ROADS))}
     for road, pace in enumerate(config.pace):
         assert limits[road] == {np.ceil(10.0 * (curriculum.target / pace + config.slack))}
     cars = (episodes.worlds[..., LANE] >= 0).sum(axis=1)

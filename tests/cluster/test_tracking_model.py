@@ -104,7 +104,7 @@ def test_seeds_are_one_group_and_nothing_else_is():
     assert len({of(), *others}) == 1 + len(others)
     assert of(actions="continuous") == "curved evolution mlp:64+steering+continuous"
     assert of(population=64, sigma=0.1) == "curved evolution mlp:64+steering, population 64, sigma 0.1"
-    assert of(search="random", traffic=3) == "curved random mlp:64+motion+steering 3 cars"
+    assert of(search="random", traffic=3) == "curved random mlp:128+motion+steering 3 cars"
     assert model_name(EvolveSettings("maps/my town@2.png")) == "gridsim-my_town_2-evolution"
 
 
