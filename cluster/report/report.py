@@ -28,7 +28,7 @@ def write_report(
     get_map: Callable[[int], Map],
     episodes: Episodes,
 ) -> None:
-    """Write curves.png, trajectory.png and drive.html: drives of the champion and of elites in the last road's first episode.
+    """Write curves.png, trajectory.png and drive.html: drives of champion and elites in the last road's first episode.
 
     Args: the history's rows; the network of each step, float32 [steps, genes]; a map by its seed.
     """
