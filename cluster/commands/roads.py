@@ -16,9 +16,9 @@ from cluster.settings import IN_WORDS
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.network import junctions
-from gridsim.maps.parts import divided, files_of, is_map_file
+from gridsim.maps.parts import divided, files_of, is_map_file, roads_of
 from gridsim.maps.real.load import described, split_crop
-from gridsim.maps.scenarios import build, check_name, has_lanes, label
+from gridsim.maps.scenarios import build, check_name, full_name, has_lanes, label
 
 MAP = "gridsim-map"
 
@@ -42,6 +42,8 @@ def _map() -> int:
     if flags.output and Path(flags.output).suffix != ".png":
         raise GridSimError(f"--output {flags.output}: a picture is a .png")
     name = flags.file + (f"@{flags.crop}" if flags.crop else "")
+    if len(roads_of(full_name(name))) > 1:
+        raise GridSimError(f"{name} is several roads; name one of them, or a folder")
     check_name(name)
     if flags.crop and split_crop(name)[1] is None:
         raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")

@@ -22,7 +22,7 @@ Groups = dict[tuple[str, str], list[Run]]
 Columns = Mapping[str, tuple[str, float, int]]  # of each column: the figure, its unit's scale, decimal places
 DRIVING: Columns = {
     "success, %": ("success_rate", 100.0, 0),
-    "km per collision": ("km_per_collision", 1.0, 1),
+    "km per crash": ("km_per_collision", 1.0, 1),
     "distance, m": ("distance_m", 1.0, 0),
     "speed, m/s": ("speed_mps", 1.0, 1),
     "training, s": ("training_s", 1.0, 0),
@@ -127,7 +127,7 @@ def notes(groups: Groups) -> list[str]:
     return [
         "Medians over seeds, quartiles in brackets."
         + (f" Fewer than {FEW} seeds are too few for a verdict." if few else ""),
-        "Kilometres per collision of a champion without one are all that it drove, so at least so many.",
+        "Kilometres per crash are per collision; of a champion without one, all that it drove, so at least so many.",
         "Errors compare champions with a reference driver, which takes the bends of their paths as fast as is "
         "comfortable within the road's interval. They are means over the metres that were driven: those of a driver "
         "that crashes soon say little.",

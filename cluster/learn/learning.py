@@ -51,7 +51,7 @@ class Champion:
     """The best network found so far, and its figures in the validation episodes."""
 
     genome: np.ndarray  # float32 [genes]
-    score: float = 0.0  # the least of `Curriculum.validation_scores`
+    score: float = 0.0  # of `Curriculum.validation_scores`, of several roads the success on the worst one
     success_rate: float = 0.0
     # Between equal scores: mean distance (m), of several roads the mean score, or a fitness of the user's own.
     tie_break: float = 0.0
@@ -141,12 +141,17 @@ class Learning(ABC):
         score, tie_break = self._standing(results)
         if self.champion is None or (score, tie_break) > (self.champion.score, self.champion.tie_break):
             self.champion = Champion(candidate, score, float(success_rate(results)[0]), tie_break, step)
-        self.solved = self.champion.score >= self.settings.until
+            self.solved = bool(self.curriculum.validation_scores(results[0]).min() >= self.settings.until)
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
-        """What champions are compared by, from a candidate's validation, RESULT [1, episodes]; the first decides."""
+        """What champions are compared by, from a candidate's validation, RESULT [1, episodes]; the first decides.
+
+        On several roads it is success on the worst one: speed on one must not outweigh collisions on others.
+        """
         scores = self.curriculum.validation_scores(results[0])
-        return float(scores.min()), float(results["distance"].mean() if len(scores) == 1 else scores.mean())
+        if len(scores) == 1:
+            return float(scores[0]), float(results["distance"].mean())
+        return float(success_rate(results.reshape(len(scores), -1)).min()), float(scores.mean())
 
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
         """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""

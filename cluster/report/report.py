@@ -28,14 +28,15 @@ def write_report(
     get_map: Callable[[int], Map],
     episodes: Episodes,
 ) -> None:
-    """Write curves.png, trajectory.png and drive.html: drives of the champion and of elites in the first episode.
+    """Write curves.png, trajectory.png and drive.html: drives of champion and elites in the last road's first episode.
 
     Args: the history's rows; the network of each step, float32 [steps, genes]; a map by its seed.
     """
     path, settings, limit = run.path, run.settings, champion.sim.episode.time_limit
-    road_map, start = get_map(episodes.maps[int(episodes.rows[0]["map"])]), episodes.rows[0]["start"]
+    row = len(episodes.rows) - len(episodes.rows) // len(settings.crowds)
+    road_map, start = get_map(episodes.maps[int(episodes.rows[row]["map"])]), episodes.rows[row]["start"]
     pictures.curves(history, path / CURVES, settings.step_name)
-    drive = film.record(champion, road_map, start, limit, episodes.worlds[0])
+    drive = film.record(champion, road_map, start, limit, episodes.worlds[row])
     where = "" if is_map_file(road_map.name) else f", held-out map {road_map.seed:,}"
     title = f"{label(road_map.name)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
     pictures.trajectory(road_map, drive.cars, path / TRAJECTORY, title)
@@ -43,6 +44,6 @@ def write_report(
     for k in (np.unique(np.geomspace(1, len(elites), ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
         stopping.check()
         elite = dataclasses.replace(champion, genome=elites[k])
-        drive = film.record(elite, road_map, start, limit, episodes.worlds[0])
+        drive = film.record(elite, road_map, start, limit, episodes.worlds[row])
         shown.insert(0, page.Shown(f"elite of {settings.step_name} {k}", str(k), drive, stride=2))
     page.write_page(path / PAGE, f"GridSim: {run.name}, {title}", shown)

@@ -108,11 +108,12 @@ def test_a_champion_is_chosen_on_its_worst_road_first(learning):
     """And then on the mean; --until is for the worst road, too."""
     each = learning.curriculum.config.validation
 
-    def driven(*failures):
+    def driven(*failures, slow=1):
         results = np.zeros((1, len(ROADS), each), dtype=RESULT)
         results["end"], results["distance"], results["steps"] = End.SUCCESS, 2000.0, 800
         for road, count in enumerate(failures):
             results["end"][0, road, :count] = End.COLLISION
+        results["steps"][0, 0] *= slow
         return results.reshape(1, -1)
 
     def better(first, second):
@@ -124,10 +125,11 @@ def test_a_champion_is_chosen_on_its_worst_road_first(learning):
     assert better((0, 0, 0, 0, 9), (5, 5, 5, 5, 5))
     assert better((0, 2, 2, 2, 9), (0, 0, 0, 0, 9))
     assert not better((0, 0, 0, 0, 9), (0, 2, 2, 2, 9))
-    learning._judge(np.zeros(1, dtype=np.float32), driven(0, 0, 0, 0, each // 20), 2)
-    assert learning.champion.success_rate > 0.989
-    assert not learning.solved
-    learning._judge(np.zeros(1, dtype=np.float32), driven(0, 0, 0, 0, 0), 3)
+    for step, results in enumerate((driven(0, 0, 0, 0, each // 20), driven(0, 0, 0, 0, 0, slow=3))):
+        learning._judge(np.zeros(1, dtype=np.float32), results, step)
+        assert (learning.champion.step, learning.solved) == (step, False)
+        assert learning.champion.success_rate > 0.989
+    learning._judge(np.zeros(1, dtype=np.float32), driven(0, 0, 0, 0, 0), 2)
     assert learning.solved
 
 
