@@ -42,7 +42,7 @@ def test_help_fills_its_lines_has_an_example_and_says_in_words_what_happens_by_d
     assert lines[0] == f"usage: {prog} [-h] [OPTIONS]{without_flag.get(prog, '')}"
     assert 72 <= max(map(len, lines)) <= 80
     assert f"Example: {prog} " in shown[1000]
-    defaults = dict(re.findall(r"--(\w[\w-]*) [^│\n]*\(default: (.*?)\)", shown[1000]))
+    defaults = dict(re.findall(r"--(\w[\w-]*) (?:(?! --\w)[^\n])*\(default: (.*?)\)", shown[1000]))
     assert len(defaults) >= 2
     for group in ("learning", "work", "run") if prog in ("gridsim-evolve", "gridsim-dqn") else ():
         assert f" {group} options " in shown[1000]
