@@ -131,6 +131,7 @@ class RunSettings(ABC):
         return replace(
             usual, pace=pace, champion_pace=champion_pace, first_maps=usual.first_maps * len(roads),
             **metres, rewind=rewind, slack=usual.slack * sim.pace,
+            validation=max(CurriculumConfig.validation, usual.validation // len(roads)),
         )  # fmt: skip
 
     def extending(self, base: RunSettings) -> Self:
@@ -200,7 +201,7 @@ class EvolveSettings(RunSettings):
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
-    """Members of a generation; by default 256."""
+    """Members of a generation; by default 256, in traffic 128, where each drives more episodes."""
     generations: Annotated[int, IN_WORDS] = 0
     """Generations at most; by default any number. A run whose champion reaches --until stops earlier."""
     recombination: Literal["all", "two"] = "all"
@@ -231,7 +232,7 @@ class EvolveSettings(RunSettings):
         rays = "mlp:64+steering" if alone else "mlp:128+motion+steering"
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
-            "population": SearchConfig.population,
+            "population": SearchConfig.population if alone else 128,
             "car_steps": 0 if self.generations else 60_000_000,
         }
 

@@ -59,11 +59,9 @@ class CurriculumConfig:
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
-# What differs in traffic, where crashes become rare long before the search has nothing left to learn from them: most
-# episodes start before a crash, of many, and early enough before it that the car can still avoid it in several ways.
-IN_TRAFFIC = {
-    "starts": 1, "crash_starts": 8, "crash_target": 150.0, "crash_memory": 512, "rewind": 64, "leader_episodes": 64
-}  # fmt: skip
+# What differs in traffic, where crashes become rare long before the search has learned from them all that it could:
+# most episodes start before one of many crashes, and validation can tell 1 % of failures from 2 %.
+IN_TRAFFIC = {"starts": 1, "crash_starts": 8, "crash_memory": 512, "leader_episodes": 64, "validation": 1024}
 
 
 def spread_starts(
