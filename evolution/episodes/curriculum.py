@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,13 @@ class CurriculumConfig:
 
 # What differs in traffic, where crashes become rare long before the search has learned from them all that it could:
 # most episodes start before one of many crashes, and validation can tell 1 % of failures from 2 %.
-IN_TRAFFIC = {"starts": 1, "crash_starts": 8, "crash_memory": 512, "leader_episodes": 64, "validation": 1024}
+IN_TRAFFIC: dict[str, Any] = {
+    "starts": 1,
+    "crash_starts": 8,
+    "crash_memory": 512,
+    "leader_episodes": 64,
+    "validation": 1024,
+}
 
 
 def spread_starts(
