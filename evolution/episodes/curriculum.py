@@ -56,7 +56,7 @@ class CurriculumConfig:
     promising: float = 0.5  # least success rate of the leader, over `latest` generations, before one is validated
     latest: int = 4  # generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
-    validation: int = 256  # episodes of validation
+    validation: int = 256  # episodes of validation on each road
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
