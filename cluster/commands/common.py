@@ -73,8 +73,7 @@ def _traffic(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.Pr
             raise ValueError(f"'{words[0]}' is neither {', '.join(AMOUNTS)} nor a whole number")
         return words[0] if words[0] in AMOUNTS else int(words[0])  # type: ignore[return-value]
 
-    metavar = "|".join([*AMOUNTS, "INT"])
-    return tyro.constructors.PrimitiveConstructorSpec(1, metavar, read, lambda x: True, lambda x: [str(x)])
+    return tyro.constructors.PrimitiveConstructorSpec(1, "CARS", read, lambda x: True, lambda x: [str(x)])
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -55,13 +56,19 @@ class CurriculumConfig:
     promising: float = 0.5  # least success rate of the leader, over `latest` generations, before one is validated
     latest: int = 4  # generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
-    validation: int = 256  # episodes of validation
+    validation: int = 256  # episodes of validation on each road
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
 # What differs in traffic, where crashes become rare long before the search has learned from them all that it could:
 # most episodes start before one of many crashes, and validation can tell 1 % of failures from 2 %.
-IN_TRAFFIC = {"starts": 1, "crash_starts": 8, "crash_memory": 512, "leader_episodes": 64, "validation": 1024}
+IN_TRAFFIC: dict[str, Any] = {
+    "starts": 1,
+    "crash_starts": 8,
+    "crash_memory": 512,
+    "leader_episodes": 64,
+    "validation": 1024,
+}
 
 
 def spread_starts(

@@ -73,7 +73,8 @@ def test_training_meets_all_roads_alike(learning):
     assert {road_of(SETTINGS.scenario, seed)[0] for seed in curriculum.map_seeds[: curriculum.maps_in_use(0)]} == {
         *ROADS
     }
-    met, limits = np.zeros((config.groups, len(ROADS)), dtype=int), {road: set() for road in range(len(ROADS))}
+    met = np.zeros((config.groups, len(ROADS)), dtype=int)
+    limits: dict[int, set[int]] = {road: set() for road in range(len(ROADS))}
     for generation in range(len(ROADS)):
         episodes = curriculum.episodes(generation)
         roads = roads_of_episodes(episodes).reshape(config.groups, config.starts)
