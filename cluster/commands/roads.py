@@ -77,6 +77,8 @@ def _describe(name: str) -> None:
     if len(network.steps):
         side = "right" if network.hand > 0.0 else "left"
         print(f"{here.mileage[-1] / 1000:.1f} km of lanes, {junctions(network)} junctions, traffic keeps {side}")
+        if len(network.lines):
+            print(f"{len(network.lines)} stop lines of traffic lights (traffic.lights of --sim: docs/roads.md)")
     else:
         print(f"no lanes, {len(here.starts)} starts")
     print(f"{road.width:g} m x {road.height:g} m; speed counts from {road.speed_low:.1f} to {road.speed_high:.1f} m/s")

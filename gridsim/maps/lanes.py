@@ -16,6 +16,7 @@ import numpy as np
 
 from gridsim.config import CROSSING_GAP
 from gridsim.jit import freeze, njit
+from gridsim.maps.lights import no_lights
 from gridsim.maps.network import Network
 from gridsim.maps.roads import THICK_WALL, Strips
 
@@ -221,6 +222,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "clear": np.zeros(cross.sum(), dtype=np.float32),
         "room": np.zeros(len(points), dtype=np.float32),
         "boxes": boxes.astype(np.float32),
+        **no_lights(n),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
     return Network(**frozen, width=np.float32(width), height=np.float32(height), hand=np.float32(1.0))

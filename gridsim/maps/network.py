@@ -37,6 +37,12 @@ class Network(NamedTuple):
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
     room: np.ndarray  # float32 [n], m that a car can move to its side of the road for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
+    # Traffic lights: float32 [lines, 5], the stop lines: middle x, y (m), direction of traffic (cosine, sine), and half
+    # the length (m) across that direction. Programs 0 to lines - 1 are theirs.
+    lines: np.ndarray
+    signals: np.ndarray  # int32 [lanes], the program by which cars enter each lane, or -1
+    program_offsets: np.ndarray  # int32 [programs + 1], where each program's part of `programs` begins
+    programs: np.ndarray  # uint8 [s], `lights.GO`, CLEARING or STOP in each second of a program, which repeats
     width: np.float32  # m, of the torus
     height: np.float32
     hand: np.float32  # the side of the road on which traffic drives: 1 right, -1 left

@@ -59,8 +59,11 @@ def _in_ego_path(network, lane, ego, way):
 
 
 @leaf
-def may_enter(network, drivers, world, i, ego):
-    """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond."""
+def may_enter(network, drivers, world, i, ego, ego_way):
+    """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond.
+
+    The ego car has the right of way for `ego_way` m at most, up to a red light.
+    """
     car = world[i]
     here, lane, beyond = I(car[s.LANE]), I(car[s.NEXT]), I(car[s.SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
@@ -116,7 +119,7 @@ def may_enter(network, drivers, world, i, ego):
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[s.COS] + dy * car[s.SIN], dy * car[s.COS] - dx * car[s.SIN]
     same_way = ego[s.COS] * car[s.COS] + ego[s.SIN] * car[s.SIN] > HALF
-    way = config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[s.SPEED], ZERO)
+    way = min(config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[s.SPEED], ZERO), ego_way)
     far = car[s.HORIZON] + lane_length(network, lane) + way + F(2.0) * place
     if dx * dx + dy * dy < far * far and not (forward < ZERO and (same_way or abs(aside) < config.EGO_BEHIND)):
         if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):

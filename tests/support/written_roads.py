@@ -12,15 +12,17 @@ HALF = 1.6  # m, half the width of a lane
 Way = tuple[Sequence[tuple[float, float]], dict[str, str]]
 
 
-def osm(ways: Sequence[Way], place: tuple[float, float] = GERMANY) -> str:
-    """Ways of points (m) with their tags; points that are the same are one node."""
+def osm(ways: Sequence[Way], place: tuple[float, float] = GERMANY, lights: Sequence[tuple[float, float]] = ()) -> str:
+    """Ways of points (m) with their tags; points that are the same are one node. Some nodes have traffic lights."""
     north, east = 111_240.0, 111_320.0 * math.cos(math.radians(place[0])) * 1.00196
     numbers: dict[tuple[float, float], int] = {}
     for points, _ in ways:
         for point in points:
             numbers.setdefault(point, len(numbers) + 1)
     nodes = "".join(
-        f'<node id="{n}" lat="{place[0] + y / north:.9f}" lon="{place[1] + x / east:.9f}" version="1"/>'
+        f'<node id="{n}" lat="{place[0] + y / north:.9f}" lon="{place[1] + x / east:.9f}" version="1">'
+        + ('<tag k="highway" v="traffic_signals"/>' if (x, y) in lights else "")
+        + "</node>"
         for (x, y), n in numbers.items()
     )
     text = ""
@@ -65,8 +67,10 @@ def both_ways(length: float, hand: float = 1.0) -> list[Bounds]:
     return [there, back] if hand > 0 else [there[::-1], back[::-1]]
 
 
-def commonroad(lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None) -> str:
-    """Lanelets, numbered from 1, with their successors."""
+def commonroad(
+    lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None, lights: dict[int, int] | None = None
+) -> str:
+    """Lanelets, numbered from 1, with their successors; `lights` are red for so many steps of 0.1 s at first."""
 
     def bound(name: str, points: Sequence[tuple[float, float]]) -> str:
         return f"<{name}>" + "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in points) + f"</{name}>"
@@ -75,12 +79,17 @@ def commonroad(lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | N
     for k, (left, right) in enumerate(lanes, 1):
         after = "".join(f'<successor ref="{s}"/>' for s in (successors or {}).get(k, ()))
         sign = '<trafficSignRef ref="900"/>'
+        if k in (lights or {}):
+            sign += f'<trafficLightRef ref="{800 + k}"/>'
         text += f'<lanelet id="{k}">{bound("leftBound", left)}{bound("rightBound", right)}{after}{sign}</lanelet>'
     element = "<trafficSignID>274</trafficSignID><additionalValue>13.89</additionalValue>"
     signs = f'<trafficSign id="900"><trafficSignElement>{element}</trafficSignElement></trafficSign>'
-    return (
-        f'<?xml version="1.0"?><commonRoad commonRoadVersion="2020a" benchmarkID="ZAM_A-1">{text}{signs}</commonRoad>'
-    )
+    for k, red in (lights or {}).items():
+        phases = [("red", red), ("redYellow", 10), ("green", 300), ("yellow", 30)]
+        steps = [f"<cycleElement><duration>{n}</duration><color>{c}</color></cycleElement>" for c, n in phases]
+        signs += f'<trafficLight id="{800 + k}"><cycle>{"".join(steps)}</cycle></trafficLight>'
+    head = '<commonRoad timeStepSize="0.1" commonRoadVersion="2020a" benchmarkID="ZAM_A-1">'
+    return f'<?xml version="1.0"?>{head}{text}{signs}</commonRoad>'
 
 
 def lanelet2(lanes: Sequence[Bounds]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ class Lane:
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
     junction: str | None = None  # of the file; "": the lane is outside of junctions; None: the format does not tell
+    light: str = ""  # the program by which cars enter it: g, y or r for each second, repeated; "": no light
 
     @property
     def centre(self) -> np.ndarray:
@@ -99,7 +101,7 @@ def part_of(lane: Lane, first: float, last: float) -> Lane:
     left, right = (
         np.column_stack([np.interp(at, shares, column) for column in bound.T]) for bound in (lane.left, lane.right)
     )
-    return replace(lane, left=left, right=right, successors=[])
+    return replace(lane, left=left, right=right, successors=[], light="" if first > 0.0 else lane.light)
 
 
 def joined(one: Lane, other: Lane) -> Lane:
@@ -110,7 +112,15 @@ def joined(one: Lane, other: Lane) -> Lane:
     junction = one.junction if one.length > other.length else other.junction
     speed = (one if one.length > other.length else other).speed if speeds else math.nan
     successors = list(other.successors)
-    return replace(one, left=left[kept], right=right[kept], speed=speed, successors=successors, junction=junction)
+    return replace(
+        one,
+        left=left[kept],
+        right=right[kept],
+        speed=speed,
+        successors=successors,
+        junction=junction,
+        light=one.light or other.light,
+    )
 
 
 def _without_returns(line: np.ndarray) -> list[int]:
@@ -143,6 +153,15 @@ def groups_of(lanes: dict[str, Lane]) -> list[list[str]]:
             group.append(right)
         done.update(group)
         found.append(group)
+    return found
+
+
+def predecessors(lanes: dict[str, Lane]) -> dict[str, list[str]]:
+    """The lanes that lead to each lane."""
+    found = defaultdict(list)
+    for key, lane in lanes.items():
+        for other in lane.successors:
+            found[other].append(key)
     return found
 
 

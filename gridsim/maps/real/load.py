@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.errors import GridSimError
 from gridsim.jit import CACHE_FOLDER, F, freeze
+from gridsim.maps.lights import no_lights
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network, make_network
 from gridsim.maps.parts import CROP
@@ -28,6 +29,7 @@ from gridsim.maps.real.commonroad import read_commonroad
 from gridsim.maps.real.content import format_of, parse, read_content
 from gridsim.maps.real.description import Lane, RealRoad
 from gridsim.maps.real.lanelet2 import read_lanelet2
+from gridsim.maps.real.lights import with_lights
 from gridsim.maps.real.shape import network_of, resampled, shaped
 from gridsim.maps.real.sumo import convert, read_net
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
@@ -140,7 +142,8 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     hand = hand_of(road.lanes)
     lanes, conflicts = shaped(road.lanes, gap, size)
     nodes = clearance_of(lanes, outlines, size)
-    network = network_of(lanes, conflicts, hand)
+    road_there = make_road(nodes, (0.0, 1.0), 2.0 * HALF_WALL)
+    network = with_lights(network_of(lanes, conflicts, hand), lanes, road_there)
     limits = np.array([lane.speed for lane in lanes.values()])
     limits[~(limits >= SLOWEST_LIMIT)] = USUAL_LIMIT
     return Prepared(road.format, road.notes, origin, nodes, network, limits)
@@ -164,6 +167,8 @@ def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
 def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
     """The map."""
     network, limits = prepared.network, prepared.limits
+    if not config.traffic.lights:
+        network = network._replace(**no_lights(len(limits)))
     lengths = (np.diff(network.offsets) - 1) * network.steps
     order = np.argsort(limits)
     usual = float(limits[order][np.searchsorted(np.cumsum(lengths[order]), lengths.sum() / 2)])

@@ -15,13 +15,16 @@ import numpy as np
 from gridsim.errors import GridSimError
 from gridsim.maps.real.content import INSTALL, Element, parse
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_repeats
+from gridsim.maps.real.lights import program
 
 TIME_LIMIT = 120.0  # s
+COLOURS = {"r": "r", "u": "r", "y": "y", "Y": "y"}  # of a link in a phase; all others are green, or off
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
     "osm": [
         "--keep-edges.by-vclass=passenger", "--geometry.remove", "--junctions.join", "--osm.layer-elevation=6",
         "--default.junctions.radius=6", "--junctions.internal-link-detail=12",
+        "--tls.guess-signals", "--tls.discard-simple",
     ],
     "opendrive": [
         "--keep-edges.by-vclass=passenger", "--opendrive.curve-resolution=0.5", "--output.original-names",
@@ -176,6 +179,7 @@ def _add_connections(
         for c in root.iterfind("connection")
         if c.get("from", "").startswith(":")
     }
+    programs = {logic.get("id"): _program(logic) for logic in root.iterfind("tlLogic")}
     leads_to = {edge.get("id", ""): edge.get("to", "") for edge in root.iterfind("edge")}
     turns = 0
     for number, connection in enumerate(root.iterfind("connection")):
@@ -202,10 +206,24 @@ def _add_connections(
         name = f"{ends[0]}>{ends[1]}#{number}"
         width = min(np.hypot(*(lane.left - lane.right)[at, :2]) for lane, at in ((one, -1), (other, 0)))
         junction = leads_to[connection.get("from", "")]
-        road.lanes[name] = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction)
+        columns = programs.get(connection.get("tl"), [])
+        link = int(connection.get("linkIndex", "-1"))
+        light = columns[link] if 0 <= link < len(columns) else ""
+        road.lanes[name] = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction, light=light)
         one.successors.append(name)
     if turns:
         road.notes.append(f"{turns} U-turns are not ways of traffic")
+
+
+def _program(logic: Element) -> list[str]:
+    """For each link of a traffic light, `Lane.light`."""
+    phases = [(phase.get("state", ""), float(phase.get("duration", "0"))) for phase in logic.iterfind("phase")]
+    links = min((len(state) for state, _ in phases), default=0)
+    colours = [[COLOURS.get(state[link], "g") for state, _ in phases] for link in range(links)]
+    return [
+        program([*zip(column, (t for _, t in phases), strict=True)], float(logic.get("offset", "0")))
+        for column in colours
+    ]
 
 
 def _curve(start: np.ndarray, end: np.ndarray) -> np.ndarray:
