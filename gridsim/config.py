@@ -58,6 +58,7 @@ EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predict
 STANDING = _F(0.1)  # m/s below which a car stands
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
+PRIORITY_TIME = _F(4.0)  # s after a car that gives way enters a junction, within which no car with priority comes
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
 EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line

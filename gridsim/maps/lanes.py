@@ -220,6 +220,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "yields": np.zeros(0, dtype=np.uint8),
         "room": np.zeros(len(points), dtype=np.float32),
         "boxes": boxes.astype(np.float32),
         **no_lights(n),

@@ -13,6 +13,8 @@ from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
+# To no car; to one that moves, as where four roads give way to one another in a circle; also to one that stands.
+NEVER, MOVING, ALWAYS = YIELDS = 0, 1, 2
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
 
@@ -35,6 +37,7 @@ class Network(NamedTuple):
     # Lanes with the same beginning, predecessors, successors and neighbours are not among them.
     crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
+    yields: np.ndarray  # uint8 [c], whether cars on this lane give way to those of that one: `YIELDS`; [0]: none does
     room: np.ndarray  # float32 [n], m that a car can move to its side of the road for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
     # Traffic lights: float32 [lines, 5], the stop lines: middle x, y (m), direction of traffic (cosine, sine), and half

@@ -421,7 +421,7 @@ def step_traffic(network, drivers, world, ego):
             # Without a permit, stop at the line of the junction ahead.
             line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
             if line < car[s.HORIZON]:
-                if not stops and may_enter(network, drivers, world, i, ego, ego_way):
+                if not stops and may_enter(network, drivers, world, i, ego, ego_way, seconds):
                     car[s.PERMIT] = car[s.NEXT]
                 else:
                     gap = line + drivers.jam - config.STOP_LINE_GAP

@@ -13,15 +13,33 @@ from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
+from gridsim.maps.network import is_junction
 from gridsim.maps.real import content, load, sumo
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
-from gridsim.state import COS, DISTANCE, LANE, SHIFT, SIN, SPEED, X, Y
+from gridsim.state import (
+    ALONG,
+    COS,
+    DISTANCE,
+    JUNCTION_BEHIND,
+    LANE,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SHIFT,
+    SIN,
+    SPEED,
+    SPEED_FACTOR,
+    TRAFFIC_FIELDS,
+    X,
+    Y,
+)  # fmt: skip
 from gridsim.traffic.behaviour import drivers, step_traffic
-from gridsim.traffic.world import spawn
+from gridsim.traffic.world import set_pose, spawn
 
 SIM = SimConfig()
+NOBODY = np.array([np.inf, 0, 0, 0, 0, 0, 0, 0], dtype=np.float32)
 CROSSING = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0)), street((0.0, -120.0), (0.0, 0.0), (0.0, 120.0))]
 
 
@@ -129,10 +147,47 @@ def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
     assert "4 roads that end got a turning loop" in load.described(name, SIM).notes
     world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 12, np.zeros(1, np.uint64), SIM)[0]
     assert (world[:, LANE] >= 0).sum() >= 10
-    nobody = np.array([np.inf, 0, 0, 0, 0, 0, 0, 0], dtype=np.float32)
-    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, nobody, 6000)
+    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 6000)
     assert (overlaps, off) == (0, 0)
     assert stood < 600
+
+
+MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROSSING[1]]
+
+
+def test_main_road_goes_first(tmp_path):
+    """Traffic of the other road waits for a car that comes there in 3 s, and for one that stands at the line there."""
+    here = build(written(tmp_path, "main.osm", osm(MAIN)), 0)
+    network = here.network
+    assert len(network.yields) == len(network.crossings)
+    lengths, directions = (np.diff(network.offsets) - 1) * network.steps, np.diff(network.points, axis=0)
+    towards = [k for k in range(len(lengths)) if is_junction(network, network.successors[k, 0])]
+    east_west = {k: abs(directions[network.offsets[k + 1] - 2]) @ [1.0, -1.0] > 0.0 for k in towards}
+    main, minor = (next(k for k in towards if east_west[k] == which) for which in (True, False))
+
+    def straight(lane):
+        """The lane across the junction from a lane that leads there, and the one after it."""
+        ahead = directions[network.offsets[lane + 1] - 2]
+        onward = [k for k in network.successors[lane] if k >= 0]
+        across = max(onward, key=lambda k: directions[network.offsets[k + 1] - 2] @ ahead)
+        return across, network.successors[across, 0]
+
+    for speed, away in ((8.0, 24.0), (0.0, 2.2)):
+        first = []
+        for lanes in (network, network._replace(yields=network.yields[:0])):
+            world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
+            for car, lane, v, metres in zip(world, (minor, main), (6.0, speed), (20.0, away), strict=True):
+                car[[LANE, ALONG, SPEED]] = lane, lengths[lane] - metres, v
+                car[[NEXT, SECOND_NEXT]] = straight(lane)
+                car[[JUNCTION_BEHIND, PERMIT, SPEED_FACTOR]] = -1.0, -1.0, 1.0
+                set_pose(lanes, car)
+            entered = np.zeros(2)
+            for k in range(200):
+                step_traffic(lanes, drivers(SIM), world, NOBODY)
+                entered[(entered == 0) & (world[:, LANE] != [minor, main])] = k
+            assert (entered > 0).all()
+            first.append(np.argmin(entered))
+        assert first == [1, 0]
 
 
 def test_driving_back_on_the_other_lane_is_new_distance(tmp_path):

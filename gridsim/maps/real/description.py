@@ -23,6 +23,8 @@ class Lane:
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
     junction: str | None = None  # of the file; "": the lane is outside of junctions; None: the format does not tell
+    links: frozenset[str] = frozenset()  # ways through junctions of the file that it is part of
+    yields: frozenset[str] = frozenset()  # those to which the file has it give way
     light: str = ""  # the program by which cars enter it: g, y or r for each second, repeated; "": no light
 
     @property
@@ -119,6 +121,8 @@ def joined(one: Lane, other: Lane) -> Lane:
         speed=speed,
         successors=successors,
         junction=junction,
+        links=one.links | other.links,
+        yields=one.yields | other.yields,
         light=one.light or other.light,
     )
 

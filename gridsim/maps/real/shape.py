@@ -8,11 +8,12 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import FORKS, LANE_STEP
 from gridsim.maps.lights import no_lights
-from gridsim.maps.network import Network
+from gridsim.maps.network import ALWAYS, MOVING, NEVER, Network
 from gridsim.maps.real.description import Lane, groups_of, joined, part_of, predecessors
 from gridsim.maps.real.select import on_rings
 
@@ -345,6 +346,20 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
     return lanes, Conflicts(lanes, gap, size)
 
 
+def _yields(lanes: list[Lane], cross: np.ndarray) -> np.ndarray:
+    """`Network.yields` of lanes that conflict; of two that give way to each other, as ways over several junctions may,
+    neither does.
+    """
+    gives_way = np.zeros_like(cross)
+    for k, j in np.argwhere(cross):
+        gives_way[k, j] = not lanes[k].yields.isdisjoint(lanes[j].links)
+    gives_way &= ~gives_way.T
+    _, circle = connected_components(gives_way, connection="strong")
+    in_order = gives_way & (circle[:, None] != circle)
+    kinds = np.where(in_order, ALWAYS, np.where(gives_way, MOVING, NEVER))[cross]
+    return kinds.astype(np.uint8) if kinds.any() else np.zeros(0, dtype=np.uint8)
+
+
 def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Network:
     """The network of shaped lanes; without `speeds`, `clear` and `room`."""
     intervals = {}
@@ -375,6 +390,7 @@ def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Net
         "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "yields": _yields([*lanes.values()], cross),
         "room": np.zeros(len(points), dtype=np.float32),
         "boxes": np.concatenate(boxes_of(points, offsets), axis=1).astype(np.float32),
         **no_lights(len(lanes)),

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import tempfile
+from collections import defaultdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -180,6 +181,7 @@ def _add_connections(
         if c.get("from", "").startswith(":")
     }
     programs = {logic.get("id"): _program(logic) for logic in root.iterfind("tlLogic")}
+    yields = _right_of_way(root)
     leads_to = {edge.get("id", ""): edge.get("to", "") for edge in root.iterfind("edge")}
     turns = 0
     for number, connection in enumerate(root.iterfind("connection")):
@@ -209,10 +211,34 @@ def _add_connections(
         columns = programs.get(connection.get("tl"), [])
         link = int(connection.get("linkIndex", "-1"))
         light = columns[link] if 0 <= link < len(columns) else ""
-        road.lanes[name] = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction, light=light)
+        way = _name(connection)
+        lane = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction, light=light)
+        lane.links, lane.yields = frozenset([way]), yields.get(way, frozenset())
+        road.lanes[name] = lane
         one.successors.append(name)
     if turns:
         road.notes.append(f"{turns} U-turns are not ways of traffic")
+
+
+def _name(connection: Element) -> str:
+    ends = ("from", "fromLane", "to", "toLane")
+    return " ".join(connection.get(end, "") for end in ends)
+
+
+def _right_of_way(root: Element) -> dict[str, frozenset[str]]:
+    """To which connections each has to give way: junctions number theirs by the lanes that lead to them."""
+    of_lane, yields = defaultdict(list), {}
+    for connection in root.iterfind("connection"):
+        of_lane[f"{connection.get('from')}_{connection.get('fromLane')}"].append(_name(connection))
+    for junction in root.iterfind("junction"):
+        names = [name for lane in junction.get("incLanes", "").split() for name in of_lane[lane]]
+        for request in junction.iterfind("request"):
+            answers = request.get("response", "")[::-1]
+            index = int(request.get("index", "-1"))
+            if 0 <= index < len(names):
+                others = (name for name, answer in zip(names, answers, strict=False) if answer == "1")
+                yields[names[index]] = frozenset(others)
+    return yields
 
 
 def _program(logic: Element) -> list[str]:
