@@ -7,7 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
-from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, osm, street
+from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, opendrive_crossing, osm, street
 
 from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
@@ -91,6 +91,45 @@ def test_side_of_the_road(tmp_path, name, text, hand):
     assert clear[1] < clear[0]
 
 
+def test_left_hand_opendrive_with_a_junction_is_a_mirror_image(tmp_path):
+    right, left = (
+        load.read_road(load.Path(written(tmp_path, f"{hand}.xodr", opendrive_crossing(hand)))) for hand in (1.0, -1.0)
+    )
+    assert (right.hand, left.hand) == (1.0, -1.0)
+    assert len(right.lanes) == 20
+    for key, lane in right.lanes.items():
+        image = left.lanes[key]
+        assert np.abs((lane.centre + image.centre)[:, 1] - 200.0).max() < 0.01
+        assert np.abs((lane.centre - image.centre)[:, 0]).max() < 0.01
+        assert (lane.yields, lane.links) == (image.yields, image.links)
+    here = build(str(tmp_path / "-1.0.xodr"), 0)
+    world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 10, np.zeros(1, np.uint64), SIM)[0]
+    assert drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 1200)[:2] == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.osm", osm(CROSSING)), ("b.xodr", opendrive(200.0)), ("c.xodr", opendrive_crossing())],
+)
+def test_side_that_a_user_decides(tmp_path, name, text):
+    path = written(tmp_path, name, text)
+    right, left = (load.read_road(*load.split_name(path + side)) for side in ("@right", "@left"))
+    assert [load.hand_of(road.lanes) for road in (right, left)] == [1.0, -1.0]
+    assert [build(path + side, 0).network.hand for side in ("", "@left")] == [1.0, -1.0]
+    assert label(path + "@left") == name[0]
+
+
+def test_side_of_lanes_that_lie_alone(tmp_path):
+    """Nothing else tells it; and the order of what follows a file's name does not matter."""
+    ring = [(100.0 * np.cos(a), 100.0 * np.sin(a)) for a in np.linspace(0.0, 2 * np.pi, 40)]
+    inner = [(0.97 * x, 0.97 * y) for x, y in ring]
+    path = written(tmp_path, "ring.xml", commonroad([(inner, ring)], {1: [1]}))
+    assert [build(path + side, 0).network.hand for side in ("", "@left")] == [1.0, -1.0]
+    crop = load.Path("a@b.osm"), (52.1, -3.0, 400.0), -1.0
+    assert load.split_name("a@b.osm@52.1,-3.0,400@left") == load.split_name("a@b.osm@left@52.1,-3.0,400") == crop
+    assert load.split_name("a.osm@1.2.3,4,5") == (load.Path("a.osm@1.2.3,4,5"), None, None)
+
+
 def mirrored(worlds, width):
     """Worlds in a mirror across x."""
     worlds = worlds.copy()
@@ -156,7 +195,7 @@ MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROS
 
 
 def test_main_road_goes_first(tmp_path):
-    """Traffic of the other road waits for a car that comes there in 3 s, and for one that stands at the line there."""
+    """Traffic of the other road waits for a car that comes 2 s after it, and for one that stands at the line."""
     here = build(written(tmp_path, "main.osm", osm(MAIN)), 0)
     network = here.network
     assert len(network.yields) == len(network.crossings)
@@ -172,7 +211,7 @@ def test_main_road_goes_first(tmp_path):
         across = max(onward, key=lambda k: directions[network.offsets[k + 1] - 2] @ ahead)
         return across, network.successors[across, 0]
 
-    for speed, away in ((8.0, 24.0), (0.0, 2.2)):
+    for speed, away in ((8.0, 44.0), (0.0, 2.2)):
         first = []
         for lanes in (network, network._replace(yields=network.yields[:0])):
             world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)

@@ -56,6 +56,54 @@ def opendrive(length: float, rule: str = "RHT") -> str:
     )
 
 
+def opendrive_crossing(hand: float = 1.0) -> str:
+    """Four roads of 85 m from a junction on, of one lane each way; `hand` -1: a mirror image across x, on the left."""
+    rule = "RHT" if hand > 0 else "LHT"
+
+    def road(number: int, junction: int, link: str, start: tuple[float, float, float], length: float, bend: float,
+             lanes: dict[int, str]) -> str:  # fmt: skip
+        x, y, angle = start
+        shape = f'<arc curvature="{bend * hand}"/>' if bend else "<line/>"
+        text = {
+            side: "".join(
+                f'<lane id="{round(k * hand)}" type="driving" level="false"><link>{links}</link>'
+                f'<width sOffset="0" a="{2 * HALF}" b="0" c="0" d="0"/></lane>'
+                for k, links in lanes.items()
+                if k * hand * sign > 0
+            )
+            for side, sign in (("left", 1), ("right", -1))
+        }
+        left, right = (f"<{side}>{lane}</{side}>" if lane else "" for side, lane in text.items())
+        middle = '<center><lane id="0" type="none" level="false"/></center>'
+        return (
+            f'<road name="" length="{length}" id="{number}" junction="{junction}" rule="{rule}"><link>{link}</link>'
+            f'<planView><geometry s="0" x="{x}" y="{y * hand}" hdg="{angle * hand}" length="{length}">'
+            f'{shape}</geometry></planView><lanes><laneSection s="0">{left}{middle}{right}</laneSection></lanes></road>'
+        )
+
+    radius, roads, connections = 15.0, "", ""
+    for i in range(4):
+        angle = i * math.pi / 2
+        x, y = radius * math.cos(angle), radius * math.sin(angle)
+        link = '<predecessor elementType="junction" elementId="900"/>'
+        roads += road(i + 1, -1, link, (x, y, angle), 85.0, 0.0, {1: "", -1: ""})
+        for turn, bend in ((1, -1), (2, 0), (3, 1)):  # from the first road to the second, the third and the fourth
+            j, number = (i + turn) % 4, 10 * (i + 1) + turn
+            length = 2 * radius if not bend else radius * math.pi / 2
+            ends = (("predecessor", i + 1), ("successor", j + 1))
+            link = "".join(f'<{n} elementType="road" elementId="{k}" contactPoint="start"/>' for n, k in ends)
+            own = f'<predecessor id="{round(hand)}"/><successor id="{round(-hand)}"/>'
+            roads += road(number, 900, link, (x, y, angle + math.pi), length, bend / radius, {-1: own})
+            connections += (
+                f'<connection id="{number}" incomingRoad="{i + 1}" connectingRoad="{number}" contactPoint="start">'
+                f'<laneLink from="{round(hand)}" to="{round(-hand)}"/></connection>'
+            )
+    head = '<header revMajor="1" revMinor="4" name="" version="1.00"/>'
+    return (
+        f'<?xml version="1.0"?><OpenDRIVE>{head}{roads}<junction id="900" name="">{connections}</junction></OpenDRIVE>'
+    )
+
+
 Bounds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
 
 

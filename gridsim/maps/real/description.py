@@ -48,6 +48,7 @@ class RealRoad:
     degrees: tuple[
         float, ...
     ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
+    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0 as the lanes lie
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property

@@ -58,23 +58,31 @@ def keeps_left(latitude: float, longitude: float) -> bool:
 
 
 def convert(
-    path: Path, data: bytes, kind: str, root: Element, crop: tuple[float, float, float] | None = None
+    path: Path,
+    data: bytes,
+    kind: str,
+    root: Element,
+    crop: tuple[float, float, float] | None = None,
+    hand: float | None = None,
 ) -> RealRoad:
-    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part."""
+    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part.
+
+    `hand` decides on which side traffic drives: 1 right, -1 left; None: the file does.
+    """
     options, notes = list(OPTIONS[kind]), []
     if kind == "osm":
         places = np.array([(float(n.get("lat", "nan")), float(n.get("lon", "nan"))) for n in root.iterfind("node")])
         if not len(places):
             raise GridSimError(f"{path}: it has no nodes; is it an extract of OpenStreetMap in XML?")
-        lefthand = keeps_left(*np.nanmedian(places, axis=0))
+        lefthand = keeps_left(*np.nanmedian(places, axis=0)) if hand is None else hand < 0.0
         if crop:
             half = np.array([crop[2], crop[2] / max(math.cos(math.radians(crop[0])), 0.01)]) / 2 / METRES_PER_DEGREE
             (south, west), (north, east) = crop[:2] - half, crop[:2] + half
             options.append(f"--keep-edges.in-geo-boundary={west},{south},{east},{north}")
-        if lefthand:
+        if lefthand and hand is None:
             notes.append("traffic keeps left, as the country of the coordinates does")
     else:
-        lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data
+        lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data if hand is None else hand < 0.0
     # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
     # what it makes of the file as one that keeps right is right but for the direction.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
@@ -83,6 +91,7 @@ def convert(
     road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else None)
     if turned:
         _turn_round(road)
+    road.hand = -1.0 if lefthand else 1.0
     road.format, road.notes = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE"}[kind], notes + road.notes
     return road
 
