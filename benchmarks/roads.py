@@ -33,7 +33,7 @@ from gridsim.jit import njit
 from gridsim.maps.network import wrapped
 from gridsim.maps.real import load
 from gridsim.maps.scenarios import build
-from gridsim.state import COS, LANE, SIN, SPEED, X, Y
+from gridsim.state import CAR_FIELDS, CLOCK, COS, LANE, SIN, SPEED, X, Y
 from gridsim.traffic.behaviour import drivers, step_traffic
 from gridsim.traffic.world import spawn
 
@@ -43,11 +43,12 @@ STANDS = 0.1  # m/s
 @njit(nogil=True)
 def drive(road, network, drivers, constants, world, steps) -> tuple[int, int, float, int]:
     """(Overlaps, control steps off the road, sum of speeds, most steps for which all cars stood at once)."""
-    nobody = np.zeros(5, dtype=np.float32)
+    nobody = np.zeros(CAR_FIELDS, dtype=np.float32)
     nobody[X] = np.inf  # no ego car is near
     overlaps, off, total, stood, longest = 0, 0, 0.0, 0, 0
     for _ in range(steps):
         step_traffic(network, drivers, world, nobody)
+        nobody[CLOCK] += 1.0
         moving = False
         for i in range(world.shape[0]):
             car = world[i]

@@ -58,6 +58,7 @@ EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predict
 STANDING = _F(0.1)  # m/s below which a car stands
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
+PRIORITY_TIME = _F(4.0)  # s after a car that gives way enters a junction, within which no car with priority comes
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
 EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
@@ -140,7 +141,8 @@ class TrafficConfig:
     beside: float = quantity(0.35, 0.0, 10.0, "m")  # between the sides of cars on crossing lanes, at least
     spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars at the start of an episode, at least
     spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # between a car and the ego car at the start, at least
-    courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind a car that stands this close is not idle
+    courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind what stands this close is not idle
+    lights: bool = True  # whether there are traffic lights, where a file of a road has them
 
 
 MOST_STEPS = 65_535  # control steps of an episode
@@ -201,10 +203,10 @@ class SimConfig:
                 raise GridSimError(f"{part} is a mapping with {', '.join(limits)}, not {shown(given)}")
             before = getattr(base, part)
             _check_names(f"{part}.", given, [f.name for f in dataclasses.fields(before)])
-            words = {name: str(value) for name, value in given.items() if name not in limits}
+            others = {name: n if isinstance(n, bool) else str(n) for name, n in given.items() if name not in limits}
             numbers = {name: number(given[name], f"{part}.{name}", *limits[name]) for name in given if name in limits}
             whole = {name: int(n) for name, n in numbers.items() if isinstance(limits[name][0], int) and n == int(n)}
-            parts[part] = dataclasses.replace(before, **words, **numbers | whole)
+            parts[part] = dataclasses.replace(before, **others, **numbers | whole)
         config = cls(**parts, randomise=_ranges(values.get("randomise") or {}) or base.randomise)
         config.check()
         return config
@@ -247,6 +249,8 @@ class SimConfig:
         vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
         if vehicle.model not in MODELS:
             raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {shown(vehicle.model)}")
+        if not isinstance(traffic.lights, bool):
+            raise GridSimError(f"traffic.lights must be true or false, not {shown(traffic.lights)}")
         if not vehicle.rear_axle < vehicle.wheelbase:
             text = f"below vehicle.wheelbase, {vehicle.wheelbase:g} m: the centre of mass lies between the axles"
             raise GridSimError(f"vehicle.rear_axle must be {text}, not {vehicle.rear_axle:g}")

@@ -165,7 +165,7 @@ class Simulator:
 
         Args:
             maps: the map of each car [k], or one for all.
-            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad); or [k, 7], to go on along a
+            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad); or [k, 8], to go on along a
                 route (`state.START_FIELDS`).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.

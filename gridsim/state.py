@@ -24,7 +24,8 @@ FRESH = 13  # 1 if this cell's ground is new
 YAW_RATE, SLIP = 14, 15  # rad/s, and rad between heading and course, of a dynamic vehicle model; else 0
 ROUTE_LANE, ROUTE_ALONG = 16, 17  # the car's place on its route: a lane, and m along it
 ROUTE_KEY = 18  # decides which lanes come after that one, a whole number; 0 without a route
-CAR_FIELDS = 19
+CLOCK = 19  # control steps on the clock of the traffic lights; 0 on a map without lights
+CAR_FIELDS = 20
 
 # Further columns of a car of the traffic.
 LANE = 5  # index of its lane; -1 for an absent car, which is ignored
@@ -44,9 +45,9 @@ LANE_TIMER = 19  # control steps until its next decision on a change of lanes
 SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
 TRAFFIC_FIELDS = 21
 
-# A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). If the car continues a route,
-# the start also has that route's lane and key.
-POSE, START_FIELDS = 5, 7
+# A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). If the car continues a drive,
+# the start also has its route's lane and key, and the clock of the traffic lights.
+POSE, START_FIELDS = 5, 8
 
 
 class End(IntEnum):
@@ -58,7 +59,7 @@ class End(IntEnum):
     """
 
     RUNNING = 0
-    COLLISION = 1  # off the road or into a car
+    COLLISION = 1  # off the road, into a car, or over the stop line of a red light
     IDLE = 2  # too many steps without progress
     SUCCESS = 3  # the target distance is reached
     TIME = 4  # the time limit

@@ -17,15 +17,17 @@ from gridsim.car.models import MODELS, front_velocity, move
 from gridsim.collision import collides, hits_box, stands_ahead, top_speed_near
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, I, leaf, njit
+from gridsim.maps.lights import CLEARING, crosses_line, set_clock, way_to_line
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
 from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_readings
 from gridsim.sensing.observation import ROUTE, Encoding, encoding, observe, sees
-from gridsim.sensing.rays import cast_boxes, fan, sense
+from gridsim.sensing.rays import cast_boxes, cast_lines, fan, sense
 from gridsim.sensing.route import ASTRAY, begin_route, check_lanes, follow_route
 from gridsim.state import (
     CELL,
+    CLOCK,
     COS,
     DEBT,
     DISTANCE,
@@ -103,7 +105,7 @@ def visit_cell(road, x, y, cosine, sine):
 
 @leaf
 def place(simulation, start, car, visits):
-    """Put a car at the start of an episode: start float32 [5], or [7] to continue a route (`state.START_FIELDS`)."""
+    """Put a car at the start of an episode: start float32 [5], or [8] to continue a drive (`state.START_FIELDS`)."""
     road = simulation.road
     car[:] = ZERO
     car[X] = start[0] - math.floor(start[0] / road.width) * road.width
@@ -114,22 +116,23 @@ def place(simulation, start, car, visits):
     cell = visit_cell(road, car[X], car[Y], car[COS], car[SIN])
     car[CELL], car[FRESH] = F(cell), ONE
     visits[cell] = ZERO
+    set_clock(simulation.network, start, car)
     if sees(simulation.encoding, ROUTE):
         begin_route(simulation.network, start, car)
 
 
 @leaf
 def start_from(car, start):
-    """The inverse of `place`: write a car's pose and route to start float32 [7]."""
+    """The inverse of `place`: write a car's pose, route and clock to start float32 [8]."""
     start[0], start[1] = car[X], car[Y]
     start[2] = math.atan2(car[SIN], car[COS])
     start[3], start[4] = car[SPEED], car[STEERING]
-    start[POSE], start[POSE + 1] = car[ROUTE_LANE], car[ROUTE_KEY]
+    start[POSE], start[POSE + 1], start[POSE + 2] = car[ROUTE_LANE], car[ROUTE_KEY], car[CLOCK]
 
 
 @leaf
 def look(simulation, car, world, ranges, closing, observation, history):
-    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge, a car or a stop line.
 
     Writes: ranges float32 [rays]; with traffic also closing float32 [rays], unless that is [0], as in
     `rays.cast_boxes`; the observation float32 [values]. With a `history` ranges and closing speeds are as late as the
@@ -142,6 +145,9 @@ def look(simulation, car, world, ranges, closing, observation, history):
     if world is not None:
         velocity = front_velocity(simulation.model, constants, car) if closing.shape[0] > 0 else (ZERO, ZERO)
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
+    if simulation.network.lines.shape[0] > 0:
+        seconds, reach = car[CLOCK] * constants.dt, constants.ray_range
+        cast_lines(simulation.network, fan, reach, seconds, x, y, car[COS], car[SIN], ranges, closing)
     degrade(simulation.imperfections, constants.ray_range, car, ranges)
     late_readings(history, car, ranges, closing)
     observe(simulation, car, world, ranges, closing, observation)
@@ -184,6 +190,13 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
             if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
                 crashed = True
                 break
+    waits = False
+    if simulation.network.lines.shape[0] > 0:
+        seconds = car[CLOCK] * constants.dt
+        crashed |= crosses_line(simulation.network, seconds, car, constants.half_length, x, y, cosine, sine)
+        way = way_to_line(simulation.network, seconds, CLEARING, x, y, cosine, sine)
+        waits = way < constants.courtesy + constants.half_length
+        car[CLOCK] += ONE
     if x < ZERO:
         x += road.width
     elif x >= road.width:
@@ -219,9 +232,8 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     if road.speed_low <= speed and speed <= road.speed_high:
         car[PACED] += gained
     if gained < constants.progress:
-        # Waiting behind a standing car is not idleness.
-        waits = False
-        if world is not None and near:
+        # Waiting behind a standing car, or at a light, is not idleness.
+        if world is not None and near and not waits:
             waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
         if not waits:
             car[IDLE] += ONE

@@ -17,7 +17,7 @@ from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.network import junctions
 from gridsim.maps.parts import divided, files_of, is_map_file, roads_of
-from gridsim.maps.real.load import described, split_crop
+from gridsim.maps.real.load import described, split_name
 from gridsim.maps.scenarios import build, check_name, full_name, has_lanes, label
 
 MAP = "gridsim-map"
@@ -30,7 +30,7 @@ class MapFlags:
     example: ClassVar[str] = "gridsim-map town.osm --crop 52.473,13.44,400 --output town.png"
     file: tyro.conf.Positional[str]
     """OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad, Lanelet2; a picture or a map's YAML; a folder of these; or
-    a scenario."""
+    a scenario. FILE@left or FILE@right: the side of the road, where the file does not say it rightly."""
     crop: Annotated[str, IN_WORDS] = ""
     """Read only a square: LAT,LON,METRES of its middle and its side; X,Y,METRES where a file is in metres."""
     output: Annotated[str, IN_WORDS] = ""
@@ -45,7 +45,7 @@ def _map() -> int:
     if len(roads_of(full_name(name))) > 1:
         raise GridSimError(f"{name} is several roads; name one of them, or a folder")
     check_name(name)
-    if flags.crop and split_crop(name)[1] is None:
+    if flags.crop and split_name(name)[1] is None:
         raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")
     files = files_of(name)
     if flags.output and len(files) > 1:
@@ -70,13 +70,17 @@ def _describe(name: str) -> None:
     config = SimConfig()
     here = build(name, 0, config)
     road, network = here.road, here.network
-    if is_map_file(name) and has_lanes(name):
+    is_road = is_map_file(name) and has_lanes(name)
+    if is_road:
         found = described(name, config)
-        print(f"{split_crop(name)[0]}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
+        print(f"{split_name(name)[0]}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
         print(f"  the map's lower left corner is the file's x {found.origin[0]:g} m, y {found.origin[1]:g} m")
     if len(network.steps):
-        side = "right" if network.hand > 0.0 else "left"
+        side, other = ("right", "left") if network.hand > 0.0 else ("left", "right")
+        side += f" (if that is wrong: FILE@{other})" if is_road else ""
         print(f"{here.mileage[-1] / 1000:.1f} km of lanes, {junctions(network)} junctions, traffic keeps {side}")
+        if len(network.lines):
+            print(f"{len(network.lines)} stop lines of traffic lights (traffic.lights of --sim: docs/roads.md)")
     else:
         print(f"no lanes, {len(here.starts)} starts")
     print(f"{road.width:g} m x {road.height:g} m; speed counts from {road.speed_low:.1f} to {road.speed_high:.1f} m/s")

@@ -25,9 +25,10 @@ from cluster.store.checkpoint import write_atomic
 from gridsim.car.vehicle import Action
 from gridsim.config import constants
 from gridsim.jit import freeze
+from gridsim.maps.lights import programs_of_lines
 from gridsim.maps.map import Map
 from gridsim.maps.roads import clearances
-from gridsim.state import DISTANCE, SPEED
+from gridsim.state import CLOCK, DISTANCE, SPEED
 from gridsim.view.marks import lane_marks
 
 TURN = 1 << 16
@@ -82,6 +83,7 @@ class Shown:
             "short": self.short,
             "end": drive.end.name.lower(),
             "period": drive.period * self.stride,
+            "clock": float(cars[0, CLOCK]) * drive.period,
             "cars": boxes.shape[1],
             "rays": rays,
             "outputs": outputs,
@@ -104,6 +106,7 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
     """
     last = shown[-1].drive
     road_map, constant, unit = last.scenario.magnified(), constants(last.sim), last.sim.unit
+    lines, programs = road_map.network.lines.astype(float), programs_of_lines(road_map.network)
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
     data = {
         "title": title,
@@ -118,6 +121,11 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
         "fan": [float(constant.ray_first), float(constant.ray_step)],
         # Centre x, y (m) and half of the dash dx, dy (m).
         "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
+        # Stop lines: as marks, and for each second the number of the colour that the light shows.
+        "lights": [
+            [round(n, 2) for n in (x, y, -half * sine, half * cosine)] + ["".join(map(str, program))]
+            for (x, y, cosine, sine, half), program in zip(lines, programs, strict=True)
+        ],
         "picture": base64.b64encode(_picture(road_map)).decode(),
         "together": together,
         "drives": [each.packed() for each in shown],

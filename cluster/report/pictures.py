@@ -113,7 +113,7 @@ def _ground(axis: Any, scenario: Map, title: str) -> None:
 
 @plain_style()
 def road_map(scenario: Map, path: Path, title: str) -> None:
-    """Draw a map and its lanes to a PNG: arrows in driving direction, red where lanes cross or merge."""
+    """Draw a map and its lanes to a PNG: arrows in driving direction, red where lanes cross or merge; stop lines."""
     from matplotlib.collections import LineCollection
 
     figure, (axis,) = figure_of(12.0, 11.0)
@@ -124,6 +124,9 @@ def road_map(scenario: Map, path: Path, title: str) -> None:
     for shift in product((-1, 0, 1), repeat=2) if lanes else ():
         moved = [points + np.array(shift) * size for points in lanes]
         axis.add_collection(LineCollection(moved, colors=np.where(crossed, "#ff6b6b", "#74c0fc"), linewidths=0.8))
+    x, y, cosine, sine, half = network.lines.T
+    ends = [np.stack([x + side * half * sine, y - side * half * cosine], axis=1) for side in (-1.0, 1.0)]
+    axis.add_collection(LineCollection([*np.stack(ends, axis=1)], colors="#ffd43b", linewidths=2.0))
     for points in lanes:
         one, other = points[len(points) // 2 - 1] % size, points[len(points) // 2] % size
         style = {"arrowstyle": "-|>", "color": "#ffffff", "linewidth": 0.4, "mutation_scale": 6}

@@ -75,7 +75,7 @@ def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
 class EpisodeSetup(NamedTuple):
     """Start and limits of an episode as kernels read them."""
 
-    start: np.ndarray  # float32 [7]
+    start: np.ndarray  # float32 [8]
     target: np.float32  # m
     steps: int
 
@@ -275,7 +275,7 @@ def _rollout(
 ):  # fmt: skip
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
-    If rewind > 0, also fills rewound [n, 7] and rewound_worlds [n, cars, fields].
+    If rewind > 0, also fills rewound [n, 8] and rewound_worlds [n, cars, fields].
     """
     workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0], command)
     for i in range(genomes.shape[0]):
@@ -328,7 +328,7 @@ def evaluate(
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
     with, float32 [e, cars, TRAFFIC_FIELDS]; whether results have the figures of comfort.
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
-    start of shorter ones, as starts float32 [n, k, 7]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
+    start of shorter ones, as starts float32 [n, k, 8]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:

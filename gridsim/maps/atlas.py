@@ -17,7 +17,9 @@ class Atlas(NamedTuple):
 
     field: np.ndarray  # `Road.field` of all maps
     lanes: Network  # the arrays of all maps' networks
-    bounds: np.ndarray  # int64 [maps + 1, 4], where each map's part of the field, points, lanes and crossings begin
+    # int64 [maps + 1, 8], where each map's part of the field, points, lanes, crossings, stop lines, programs, their
+    # seconds and `yields` begin
+    bounds: np.ndarray
     sides: np.ndarray  # uint32 [maps, 2], columns and rows
     sizes: np.ndarray  # float32 [maps, 9], the other fields of `Road`, and `Network.hand`
 
@@ -28,13 +30,17 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0], hand[0]])
     fields = [road.field for road in roads]
     lengths = [
-        (len(r.field), len(n.points), len(n.steps), len(n.crossings)) for r, n in zip(roads, networks, strict=True)
-    ]
+        (
+            len(r.field), len(n.points), len(n.steps), len(n.crossings), len(n.lines), len(n.program_offsets) - 1,
+            len(n.programs), len(n.yields),
+        )
+        for r, n in zip(roads, networks, strict=True)
+    ]  # fmt: skip
     sizes = [(*tuple(r)[3:], n.hand) for r, n in zip(roads, networks, strict=True)]
     return Atlas(
         field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
         lanes=lanes,
-        bounds=freeze(np.cumsum([(0, 0, 0, 0), *lengths], axis=0, dtype=np.int64)),
+        bounds=freeze(np.cumsum([(0,) * 8, *lengths], axis=0, dtype=np.int64)),
         sides=freeze(np.array([(r.columns, r.rows) for r in roads], dtype=np.uint32)),
         sizes=freeze(np.array(sizes, dtype=np.float32)),
     )
@@ -63,8 +69,13 @@ def network_of(atlas: Atlas, m: int) -> Network:
         lanes.crossing_offsets[here[2] + m : there[2] + m + 1],
         lanes.crossings[here[3] : there[3]],
         lanes.clear[here[3] : there[3]],
+        lanes.yields[here[7] : there[7]],
         lanes.room[here[1] : there[1]],
         lanes.boxes[here[2] : there[2]],
+        lanes.lines[here[4] : there[4]],
+        lanes.signals[here[2] : there[2]],
+        lanes.program_offsets[here[5] + m : there[5] + m + 1],
+        lanes.programs[here[6] : there[6]],
         atlas.sizes[m, 0],
         atlas.sizes[m, 1],
         atlas.sizes[m, 8],

@@ -16,6 +16,7 @@ import numpy as np
 
 from gridsim.config import CROSSING_GAP
 from gridsim.jit import freeze, njit
+from gridsim.maps.lights import no_lights
 from gridsim.maps.network import Network
 from gridsim.maps.roads import THICK_WALL, Strips
 
@@ -219,8 +220,10 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "yields": np.zeros(0, dtype=np.uint8),
         "room": np.zeros(len(points), dtype=np.float32),
         "boxes": boxes.astype(np.float32),
+        **no_lights(n),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
     return Network(**frozen, width=np.float32(width), height=np.float32(height), hand=np.float32(1.0))

@@ -13,6 +13,8 @@ from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
+# To no car; to one that moves, as where four roads give way to one another in a circle; also to one that stands.
+NEVER, MOVING, ALWAYS = YIELDS = 0, 1, 2
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
 
@@ -35,8 +37,15 @@ class Network(NamedTuple):
     # Lanes with the same beginning, predecessors, successors and neighbours are not among them.
     crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
+    yields: np.ndarray  # uint8 [c], whether cars on this lane give way to those of that one: `YIELDS`; [0]: none does
     room: np.ndarray  # float32 [n], m that a car can move to its side of the road for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
+    # Traffic lights: float32 [lines, 5], the stop lines: middle x, y (m), direction of traffic (cosine, sine), and half
+    # the length (m) across that direction. Programs 0 to lines - 1 are theirs.
+    lines: np.ndarray
+    signals: np.ndarray  # int32 [lanes], the program by which cars enter each lane, or -1
+    program_offsets: np.ndarray  # int32 [programs + 1], where each program's part of `programs` begins
+    programs: np.ndarray  # uint8 [s], `lights.GO`, CLEARING or STOP in each second of a program, which repeats
     width: np.float32  # m, of the torus
     height: np.float32
     hand: np.float32  # the side of the road on which traffic drives: 1 right, -1 left

@@ -24,7 +24,8 @@ TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_00
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
 YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
-CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)")  # a square of a file: its path, middle and side
+# A square of a file: its path, middle and side.
+CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)(?:@left|@right)?")
 _TURNS = 0, 1, 2, 0, 0  # the parts of files in turn, and of regions along a row
 _REGIONS = 10  # along the longer side of a map
 

@@ -1,4 +1,5 @@
-"""The range sensor: rays over the forward field of view, to the road's edge (`sense`) and other cars (`cast_boxes`).
+"""The range sensor: rays over the forward field of view, to the road's edge (`sense`), other cars (`cast_boxes`) and
+stop lines of lights (`cast_lines`).
 
 A ray is marched through the signed clearance field d to its root. It takes steps longer than the clearance while the
 road is wide, and Newton steps near the edge, with slopes of the bilinear field.
@@ -15,6 +16,7 @@ import math
 import numpy as np
 
 from gridsim.jit import ONE, ZERO, F, I, freeze, leaf
+from gridsim.maps.lights import GO, light
 from gridsim.maps.network import wrapped
 from gridsim.maps.roads import CELLS_PER_UNIT, THICK_WALL
 from gridsim.sensing.simd import LEAP, MARGIN, SIMD_RAYS, vector_march
@@ -114,3 +116,26 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
                 if closing.shape[0] > 0:
                     # The box moves along its heading, its x axis.
                     closing[r] = velocity[0] * fan[0, r] + velocity[1] * fan[1, r] - world[j, SPEED] * ux
+
+
+@leaf
+def cast_lines(network, fan, reach, seconds, x, y, cosine, sine, ranges, closing):
+    """Shorten ranges (m) to stop lines whose light is not green, for rays that go over them the way traffic does.
+
+    Args as in `cast_boxes`; `seconds` on the lights' clock. The closing speed of such a ray is 0.
+    """
+    for k in range(network.lines.shape[0]):
+        line = network.lines[k]
+        dx, dy = wrapped(line[0] - x, network.width), wrapped(line[1] - y, network.height)
+        ahead, aside = dx * line[2] + dy * line[3], dy * line[2] - dx * line[3]
+        if ahead <= ZERO or ahead > reach or light(network, k, seconds) == GO:
+            continue
+        along, across = cosine * line[2] + sine * line[3], sine * line[2] - cosine * line[3]  # the heading
+        for r in range(ranges.shape[0]):
+            over = along * fan[0, r] - across * fan[1, r]
+            if over > ZERO and ahead < ranges[r] * over:
+                at = ahead / over
+                if abs(at * (across * fan[0, r] + along * fan[1, r]) - aside) <= line[4]:
+                    ranges[r] = at
+                    if closing.shape[0] > 0:
+                        closing[r] = ZERO

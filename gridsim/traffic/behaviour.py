@@ -17,6 +17,7 @@ from gridsim import config
 from gridsim import state as s
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import HALF, ONE, ZERO, F, I, U, leaf, njit
+from gridsim.maps.lights import GO, NO_LINE, STOP, light, way_to_line
 from gridsim.maps.network import is_junction, lane_length, to_side, torus_distance, wrapped, wrapped_any
 from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
@@ -395,10 +396,15 @@ def _move(network, drivers, car, ego):
 def step_traffic(network, drivers, world, ego):
     """One control period of a world's traffic. The ego car must not have moved yet.
 
-    Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read.
+    Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read, and CLOCK if the
+    network has lights.
     """
     cars = world.shape[0]
     _find_gaps(network, drivers, world, ego)
+    lit, seconds, ego_way = network.lines.shape[0] > 0, ZERO, NO_LINE
+    if lit:
+        seconds = ego[s.CLOCK] * drivers.dt
+        ego_way = way_to_line(network, seconds, STOP, ego[s.X], ego[s.Y], ego[s.COS], ego[s.SIN])
     for i in range(cars):
         car = world[i]
         if car[s.LANE] < ZERO:
@@ -406,16 +412,21 @@ def step_traffic(network, drivers, world, ego):
         lane, onward = I(car[s.LANE]), I(car[s.NEXT])
         desired = _desired(network, car)
         pace = idm(drivers, car[s.SPEED], desired, car[s.GAP] - drivers.half_length, car[s.LEAD_SPEED])
+        stops = lit and network.signals[U(onward)] >= 0 and light(network, network.signals[U(onward)], seconds) != GO
+        if stops and car[s.PERMIT] == car[s.NEXT]:
+            line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
+            if line > car[s.SPEED] * car[s.SPEED] / (F(2.0) * drivers.comfort):  # it can still stop
+                car[s.PERMIT] = -ONE
         if is_junction(network, onward) and car[s.PERMIT] != car[s.NEXT]:
             # Without a permit, stop at the line of the junction ahead.
             line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
             if line < car[s.HORIZON]:
-                if may_enter(network, drivers, world, i, ego):
+                if not stops and may_enter(network, drivers, world, i, ego, ego_way, seconds):
                     car[s.PERMIT] = car[s.NEXT]
                 else:
                     gap = line + drivers.jam - config.STOP_LINE_GAP
                     pace = min(pace, idm(drivers, car[s.SPEED], desired, gap, ZERO))
-                    waits = is_junction(network, lane) and car[s.SPEED] < config.STANDING
+                    waits = is_junction(network, lane) and car[s.SPEED] < config.STANDING and not stops
                     car[s.PERMIT] = car[s.PERMIT] - ONE if waits else -ONE
                     if -car[s.PERMIT] * drivers.dt > config.GRIDLOCK:
                         car[s.LANE] = -ONE

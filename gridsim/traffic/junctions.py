@@ -9,8 +9,9 @@ import math
 
 from gridsim import config
 from gridsim import state as s
-from gridsim.jit import HALF, ZERO, F, I, leaf
-from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
+from gridsim.jit import HALF, ZERO, F, I, U, leaf
+from gridsim.maps.lights import GO, light
+from gridsim.maps.network import ALWAYS, MOVING, is_junction, lane_length, wrapped, wrapped_any
 
 
 @leaf
@@ -59,8 +60,31 @@ def _in_ego_path(network, lane, ego, way):
 
 
 @leaf
-def may_enter(network, drivers, world, i, ego):
-    """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond."""
+def _must_yield(network, drivers, car, other, first, last, seconds):
+    """Whether a car has to give way to another that comes to a lane with priority over its next lane."""
+    onward, speed = I(other[s.NEXT]), other[s.SPEED]
+    if not is_junction(network, onward):
+        return False
+    if network.signals[U(onward)] >= 0 and light(network, network.signals[U(onward)], seconds) != GO:
+        return False
+    way = lane_length(network, I(other[s.LANE])) - other[s.ALONG] - drivers.half_length
+    own = max(lane_length(network, I(car[s.LANE])) - car[s.ALONG] - drivers.half_length, ZERO)
+    time = config.PRIORITY_TIME + own / max(car[s.SPEED], config.WALKING_PACE)
+    stands = speed < config.WALKING_PACE
+    if way > (F(2.0) * config.STOP_LINE_GAP if stands else speed * time):
+        return False
+    for c in range(first, last):
+        if network.crossings[c] == onward:
+            return network.yields[c] == ALWAYS or (network.yields[c] == MOVING and not stands)
+    return False
+
+
+@leaf
+def may_enter(network, drivers, world, i, ego, ego_way, seconds):
+    """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond.
+
+    The ego car has the right of way for `ego_way` m at most, up to a red light; `seconds` on the lights' clock.
+    """
     car = world[i]
     here, lane, beyond = I(car[s.LANE]), I(car[s.NEXT]), I(car[s.SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
@@ -73,6 +97,8 @@ def may_enter(network, drivers, world, i, ego):
             continue
         there, past, permit = I(world[j, s.LANE]), I(world[j, s.JUNCTION_BEHIND]), I(world[j, s.PERMIT])
         onward = I(world[j, s.NEXT])
+        if network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds):
+            return False
         # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
@@ -116,7 +142,7 @@ def may_enter(network, drivers, world, i, ego):
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[s.COS] + dy * car[s.SIN], dy * car[s.COS] - dx * car[s.SIN]
     same_way = ego[s.COS] * car[s.COS] + ego[s.SIN] * car[s.SIN] > HALF
-    way = config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[s.SPEED], ZERO)
+    way = min(config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[s.SPEED], ZERO), ego_way)
     far = car[s.HORIZON] + lane_length(network, lane) + way + F(2.0) * place
     if dx * dx + dy * dy < far * far and not (forward < ZERO and (same_way or abs(aside) < config.EGO_BEHIND)):
         if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):

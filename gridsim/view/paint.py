@@ -24,6 +24,7 @@ EGO, OTHER, PARKED = (255, 92, 43), (96, 168, 232), (152, 160, 171)
 GLASS, TYRE, LIGHT = (28, 32, 40), (24, 25, 29), (255, 246, 214)
 RAY, PATH, ROUTE = (92, 225, 200), (233, 172, 86), (240, 120, 235)
 HUD = (20, 22, 28)
+SIGNALS = (64, 192, 87), (250, 190, 40), (240, 50, 50)  # of `lights.GO`, CLEARING and STOP
 
 SQUARE = 16.0  # m, side of the ground's squares
 EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width

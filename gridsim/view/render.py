@@ -20,9 +20,10 @@ from PIL import Image, ImageDraw, ImageFont
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import freeze
+from gridsim.maps.lights import programs_of_lines
 from gridsim.maps.map import Map
 from gridsim.packages import check_extra
-from gridsim.state import COS, SIN, STEERING, X, Y
+from gridsim.state import CLOCK, COS, SIN, STEERING, X, Y
 from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
@@ -50,6 +51,7 @@ class Renderer:
         self._anchor = np.array([width / 2, height * CAR_AT])
         self._centre, self._up = self.road_map.size / 2, np.array([0.0, 1.0])
         self._marks = lane_marks(self.road_map)
+        self._programs = programs_of_lines(self.road_map.network)
         self._parked = self.road_map.strips.blocks
         vehicle, k = self.config.vehicle, self._constants
         lengths = vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle)
@@ -102,7 +104,8 @@ class Renderer:
         origin = self._centre - (self._anchor[0] - 0.5) * metre * right + (self._anchor[1] - 0.5) * metre * self._up
         steps = right * metre, -self._up * metre
         paint.draw_ground(self._road, self.road_map.torus, origin, *steps, self.pixels_per_m, image)
-        shapes = [self._mark_shapes(), self._block_shapes()]
+        seconds = int(car[CLOCK] * self.config.episode.control_period)
+        shapes = [self._mark_shapes(), self._block_shapes(), self._light_shapes(seconds)]
         if path is not None:
             shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64) * self._per_m))
         if route is not None:
@@ -153,6 +156,14 @@ class Renderer:
         marks, at = marks[seen], at[seen]
         colour = np.where(marks[:, 5:6] > 0, np.array(paint.MARK_OPPOSITE), np.array(paint.MARK))
         return self._shapes(at, self._turn(marks[:, 2:4]), marks[:, 4], 0.07, 0.02, colour, 0.9)
+
+    def _light_shapes(self, seconds: int) -> np.ndarray:
+        """Stop lines in the colours that their lights show."""
+        lines = self.road_map.network.lines.astype(float)
+        shows = [program[seconds % len(program)] for program in self._programs]
+        colour = np.array(paint.SIGNALS)[np.array(shows, dtype=int)]
+        across = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
+        return self._shapes(self.pixel(lines[:, :2]), self._turn(across), lines[:, 4], 0.2, 0.0, colour, 1.0, 1.0)
 
     def _block_shapes(self) -> np.ndarray:
         """Parked cars, with the length and width of their blocks."""

@@ -28,6 +28,7 @@ from gridsim.sensing.observation import encoding, normalise
 from gridsim.simulator import Simulator
 from gridsim.state import (
     ALONG,
+    CLOCK,
     COS,
     LANE,
     ROUTE_KEY,
@@ -98,7 +99,9 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
 
 def as_start(car):
     """About the start, as in EPISODE, of a car's state."""
-    return pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING, ROUTE_LANE, ROUTE_KEY]]])
+    return pytest.approx(
+        [*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING, ROUTE_LANE, ROUTE_KEY, CLOCK]]]
+    )
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):
@@ -106,14 +109,14 @@ def test_what_is_rewound_goes_on_as_it_did(among):
     spec, genome, maps, episodes, worlds, paths = among
     both = np.stack([genome, np.full_like(genome, np.nan)])  # whose episodes end before their first step
     plain, starts, then = evaluate(spec, both, maps, episodes, CONFIG, worlds)
-    assert (starts.shape, then.shape) == ((2, 0, 7), (2, 0, *worlds.shape[1:]))
+    assert (starts.shape, then.shape) == ((2, 0, START_FIELDS), (2, 0, *worlds.shape[1:]))
     crashed = [int(row["end"]) == End.COLLISION for row, _, _ in paths]
     wanted = episodes.copy()
     wanted["rewind"] = np.where(crashed, 64, [0, 1, 5000, 1, 5000, 0, 5000, 0, 1])
     results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds)
     assert results.tobytes() == plain.tobytes()
     kept = np.flatnonzero(wanted["rewind"])
-    assert (starts.shape, then.shape) == ((2, len(kept), 7), (2, len(kept), *worlds.shape[1:]))
+    assert (starts.shape, then.shape) == ((2, len(kept), START_FIELDS), (2, len(kept), *worlds.shape[1:]))
     for start, world, k in zip(starts[1], then[1], kept, strict=True):
         assert start == as_start(paths[k][1][0])
         assert world.tobytes() == worlds[k].tobytes()
@@ -148,7 +151,7 @@ def test_what_is_rewound_of_an_episode_without_a_step_is_its_start(among):
     both = np.stack([genome, np.full_like(genome, math.nan)])
     results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds[:1])
     assert results["steps"].tolist() == [[60], [0]]
-    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99, 99, 99], abs=1e-4)
+    assert starts[1, 0] == pytest.approx(wanted["start"][0] % [256, 256, 2 * math.pi, 99, 99, 99, 99, 99], abs=1e-4)
     assert then[1].tobytes() == worlds[:1].tobytes()
 
 
@@ -436,7 +439,7 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again(curriculum):
 
     def crash_starts(generation):
         """Of each group: [3, 2]."""
-        return curriculum.episodes(generation).rows["start"].reshape(3, 4, 7)[:, 2:, 0]
+        return curriculum.episodes(generation).rows["start"].reshape(3, 4, START_FIELDS)[:, 2:, 0]
 
     for generation in range(1, 40):
         starts = crash_starts(generation)

@@ -82,7 +82,7 @@ def test_a_file_that_is_wrong_is_refused_in_a_line_that_names_it(tmp_path, text,
 # --- Limits ----------------------------------------------------------------------------------------------------------
 
 FIELDS = [(part, f.name) for part in LIMITS for f in dataclasses.fields(getattr(DEFAULT, part))]
-NUMBERS = [(part, name) for part, name in FIELDS if not isinstance(getattr(getattr(DEFAULT, part), name), str)]
+NUMBERS = [(part, name) for part, name in FIELDS if not isinstance(getattr(getattr(DEFAULT, part), name), (str, bool))]
 
 
 @pytest.mark.parametrize(("part", "name"), NUMBERS)

@@ -7,21 +7,39 @@ import pickle
 
 import numpy as np
 import pytest
-from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, osm, street
+from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, opendrive_crossing, osm, street
 
 from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
+from gridsim.maps.network import is_junction
 from gridsim.maps.real import content, load, sumo
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
-from gridsim.state import COS, DISTANCE, LANE, SHIFT, SIN, SPEED, X, Y
+from gridsim.state import (
+    ALONG,
+    COS,
+    DISTANCE,
+    JUNCTION_BEHIND,
+    LANE,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SHIFT,
+    SIN,
+    SPEED,
+    SPEED_FACTOR,
+    TRAFFIC_FIELDS,
+    X,
+    Y,
+)  # fmt: skip
 from gridsim.traffic.behaviour import drivers, step_traffic
-from gridsim.traffic.world import spawn
+from gridsim.traffic.world import set_pose, spawn
 
 SIM = SimConfig()
+NOBODY = np.array([np.inf, 0, 0, 0, 0, 0, 0, 0], dtype=np.float32)
 CROSSING = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0)), street((0.0, -120.0), (0.0, 0.0), (0.0, 120.0))]
 
 
@@ -71,6 +89,45 @@ def test_side_of_the_road(tmp_path, name, text, hand):
     outward = hand * np.array([along[1], -along[0]]) / np.hypot(*along)
     clear = clearances(here.road, np.stack([points[k], points[k] + here.network.room[k] * outward]).astype(np.float32))
     assert clear[1] < clear[0]
+
+
+def test_left_hand_opendrive_with_a_junction_is_a_mirror_image(tmp_path):
+    right, left = (
+        load.read_road(load.Path(written(tmp_path, f"{hand}.xodr", opendrive_crossing(hand)))) for hand in (1.0, -1.0)
+    )
+    assert (right.hand, left.hand) == (1.0, -1.0)
+    assert len(right.lanes) == 20
+    for key, lane in right.lanes.items():
+        image = left.lanes[key]
+        assert np.abs((lane.centre + image.centre)[:, 1] - 200.0).max() < 0.01
+        assert np.abs((lane.centre - image.centre)[:, 0]).max() < 0.01
+        assert (lane.yields, lane.links) == (image.yields, image.links)
+    here = build(str(tmp_path / "-1.0.xodr"), 0)
+    world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 10, np.zeros(1, np.uint64), SIM)[0]
+    assert drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 1200)[:2] == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.osm", osm(CROSSING)), ("b.xodr", opendrive(200.0)), ("c.xodr", opendrive_crossing())],
+)
+def test_side_that_a_user_decides(tmp_path, name, text):
+    path = written(tmp_path, name, text)
+    right, left = (load.read_road(*load.split_name(path + side)) for side in ("@right", "@left"))
+    assert [load.hand_of(road.lanes) for road in (right, left)] == [1.0, -1.0]
+    assert [build(path + side, 0).network.hand for side in ("", "@left")] == [1.0, -1.0]
+    assert label(path + "@left") == name[0]
+
+
+def test_side_of_lanes_that_lie_alone(tmp_path):
+    """Nothing else tells it; and the order of what follows a file's name does not matter."""
+    ring = [(100.0 * np.cos(a), 100.0 * np.sin(a)) for a in np.linspace(0.0, 2 * np.pi, 40)]
+    inner = [(0.97 * x, 0.97 * y) for x, y in ring]
+    path = written(tmp_path, "ring.xml", commonroad([(inner, ring)], {1: [1]}))
+    assert [build(path + side, 0).network.hand for side in ("", "@left")] == [1.0, -1.0]
+    crop = load.Path("a@b.osm"), (52.1, -3.0, 400.0), -1.0
+    assert load.split_name("a@b.osm@52.1,-3.0,400@left") == load.split_name("a@b.osm@left@52.1,-3.0,400") == crop
+    assert load.split_name("a.osm@1.2.3,4,5") == (load.Path("a.osm@1.2.3,4,5"), None, None)
 
 
 def mirrored(worlds, width):
@@ -129,10 +186,47 @@ def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
     assert "4 roads that end got a turning loop" in load.described(name, SIM).notes
     world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 12, np.zeros(1, np.uint64), SIM)[0]
     assert (world[:, LANE] >= 0).sum() >= 10
-    nobody = np.array([np.inf, 0, 0, 0, 0, 0, 0, 0], dtype=np.float32)
-    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, nobody, 6000)
+    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 6000)
     assert (overlaps, off) == (0, 0)
     assert stood < 600
+
+
+MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROSSING[1]]
+
+
+def test_main_road_goes_first(tmp_path):
+    """Traffic of the other road waits for a car that comes 2 s after it, and for one that stands at the line."""
+    here = build(written(tmp_path, "main.osm", osm(MAIN)), 0)
+    network = here.network
+    assert len(network.yields) == len(network.crossings)
+    lengths, directions = (np.diff(network.offsets) - 1) * network.steps, np.diff(network.points, axis=0)
+    towards = [k for k in range(len(lengths)) if is_junction(network, network.successors[k, 0])]
+    east_west = {k: abs(directions[network.offsets[k + 1] - 2]) @ [1.0, -1.0] > 0.0 for k in towards}
+    main, minor = (next(k for k in towards if east_west[k] == which) for which in (True, False))
+
+    def straight(lane):
+        """The lane across the junction from a lane that leads there, and the one after it."""
+        ahead = directions[network.offsets[lane + 1] - 2]
+        onward = [k for k in network.successors[lane] if k >= 0]
+        across = max(onward, key=lambda k: directions[network.offsets[k + 1] - 2] @ ahead)
+        return across, network.successors[across, 0]
+
+    for speed, away in ((8.0, 44.0), (0.0, 2.2)):
+        first = []
+        for lanes in (network, network._replace(yields=network.yields[:0])):
+            world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
+            for car, lane, v, metres in zip(world, (minor, main), (6.0, speed), (20.0, away), strict=True):
+                car[[LANE, ALONG, SPEED]] = lane, lengths[lane] - metres, v
+                car[[NEXT, SECOND_NEXT]] = straight(lane)
+                car[[JUNCTION_BEHIND, PERMIT, SPEED_FACTOR]] = -1.0, -1.0, 1.0
+                set_pose(lanes, car)
+            entered = np.zeros(2)
+            for k in range(200):
+                step_traffic(lanes, drivers(SIM), world, NOBODY)
+                entered[(entered == 0) & (world[:, LANE] != [minor, main])] = k
+            assert (entered > 0).all()
+            first.append(np.argmin(entered))
+        assert first == [1, 0]
 
 
 def test_driving_back_on_the_other_lane_is_new_distance(tmp_path):

@@ -12,15 +12,17 @@ HALF = 1.6  # m, half the width of a lane
 Way = tuple[Sequence[tuple[float, float]], dict[str, str]]
 
 
-def osm(ways: Sequence[Way], place: tuple[float, float] = GERMANY) -> str:
-    """Ways of points (m) with their tags; points that are the same are one node."""
+def osm(ways: Sequence[Way], place: tuple[float, float] = GERMANY, lights: Sequence[tuple[float, float]] = ()) -> str:
+    """Ways of points (m) with their tags; points that are the same are one node. Some nodes have traffic lights."""
     north, east = 111_240.0, 111_320.0 * math.cos(math.radians(place[0])) * 1.00196
     numbers: dict[tuple[float, float], int] = {}
     for points, _ in ways:
         for point in points:
             numbers.setdefault(point, len(numbers) + 1)
     nodes = "".join(
-        f'<node id="{n}" lat="{place[0] + y / north:.9f}" lon="{place[1] + x / east:.9f}" version="1"/>'
+        f'<node id="{n}" lat="{place[0] + y / north:.9f}" lon="{place[1] + x / east:.9f}" version="1">'
+        + ('<tag k="highway" v="traffic_signals"/>' if (x, y) in lights else "")
+        + "</node>"
         for (x, y), n in numbers.items()
     )
     text = ""
@@ -54,6 +56,54 @@ def opendrive(length: float, rule: str = "RHT") -> str:
     )
 
 
+def opendrive_crossing(hand: float = 1.0) -> str:
+    """Four roads of 85 m from a junction on, of one lane each way; `hand` -1: a mirror image across x, on the left."""
+    rule = "RHT" if hand > 0 else "LHT"
+
+    def road(number: int, junction: int, link: str, start: tuple[float, float, float], length: float, bend: float,
+             lanes: dict[int, str]) -> str:  # fmt: skip
+        x, y, angle = start
+        shape = f'<arc curvature="{bend * hand}"/>' if bend else "<line/>"
+        text = {
+            side: "".join(
+                f'<lane id="{round(k * hand)}" type="driving" level="false"><link>{links}</link>'
+                f'<width sOffset="0" a="{2 * HALF}" b="0" c="0" d="0"/></lane>'
+                for k, links in lanes.items()
+                if k * hand * sign > 0
+            )
+            for side, sign in (("left", 1), ("right", -1))
+        }
+        left, right = (f"<{side}>{lane}</{side}>" if lane else "" for side, lane in text.items())
+        middle = '<center><lane id="0" type="none" level="false"/></center>'
+        return (
+            f'<road name="" length="{length}" id="{number}" junction="{junction}" rule="{rule}"><link>{link}</link>'
+            f'<planView><geometry s="0" x="{x}" y="{y * hand}" hdg="{angle * hand}" length="{length}">'
+            f'{shape}</geometry></planView><lanes><laneSection s="0">{left}{middle}{right}</laneSection></lanes></road>'
+        )
+
+    radius, roads, connections = 15.0, "", ""
+    for i in range(4):
+        angle = i * math.pi / 2
+        x, y = radius * math.cos(angle), radius * math.sin(angle)
+        link = '<predecessor elementType="junction" elementId="900"/>'
+        roads += road(i + 1, -1, link, (x, y, angle), 85.0, 0.0, {1: "", -1: ""})
+        for turn, bend in ((1, -1), (2, 0), (3, 1)):  # from the first road to the second, the third and the fourth
+            j, number = (i + turn) % 4, 10 * (i + 1) + turn
+            length = 2 * radius if not bend else radius * math.pi / 2
+            ends = (("predecessor", i + 1), ("successor", j + 1))
+            link = "".join(f'<{n} elementType="road" elementId="{k}" contactPoint="start"/>' for n, k in ends)
+            own = f'<predecessor id="{round(hand)}"/><successor id="{round(-hand)}"/>'
+            roads += road(number, 900, link, (x, y, angle + math.pi), length, bend / radius, {-1: own})
+            connections += (
+                f'<connection id="{number}" incomingRoad="{i + 1}" connectingRoad="{number}" contactPoint="start">'
+                f'<laneLink from="{round(hand)}" to="{round(-hand)}"/></connection>'
+            )
+    head = '<header revMajor="1" revMinor="4" name="" version="1.00"/>'
+    return (
+        f'<?xml version="1.0"?><OpenDRIVE>{head}{roads}<junction id="900" name="">{connections}</junction></OpenDRIVE>'
+    )
+
+
 Bounds = tuple[Sequence[tuple[float, float]], Sequence[tuple[float, float]]]
 
 
@@ -65,8 +115,10 @@ def both_ways(length: float, hand: float = 1.0) -> list[Bounds]:
     return [there, back] if hand > 0 else [there[::-1], back[::-1]]
 
 
-def commonroad(lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None) -> str:
-    """Lanelets, numbered from 1, with their successors."""
+def commonroad(
+    lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None, lights: dict[int, int] | None = None
+) -> str:
+    """Lanelets, numbered from 1, with their successors; `lights` are red for so many steps of 0.1 s at first."""
 
     def bound(name: str, points: Sequence[tuple[float, float]]) -> str:
         return f"<{name}>" + "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in points) + f"</{name}>"
@@ -75,12 +127,17 @@ def commonroad(lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | N
     for k, (left, right) in enumerate(lanes, 1):
         after = "".join(f'<successor ref="{s}"/>' for s in (successors or {}).get(k, ()))
         sign = '<trafficSignRef ref="900"/>'
+        if k in (lights or {}):
+            sign += f'<trafficLightRef ref="{800 + k}"/>'
         text += f'<lanelet id="{k}">{bound("leftBound", left)}{bound("rightBound", right)}{after}{sign}</lanelet>'
     element = "<trafficSignID>274</trafficSignID><additionalValue>13.89</additionalValue>"
     signs = f'<trafficSign id="900"><trafficSignElement>{element}</trafficSignElement></trafficSign>'
-    return (
-        f'<?xml version="1.0"?><commonRoad commonRoadVersion="2020a" benchmarkID="ZAM_A-1">{text}{signs}</commonRoad>'
-    )
+    for k, red in (lights or {}).items():
+        phases = [("red", red), ("redYellow", 10), ("green", 300), ("yellow", 30)]
+        steps = [f"<cycleElement><duration>{n}</duration><color>{c}</color></cycleElement>" for c, n in phases]
+        signs += f'<trafficLight id="{800 + k}"><cycle>{"".join(steps)}</cycle></trafficLight>'
+    head = '<commonRoad timeStepSize="0.1" commonRoadVersion="2020a" benchmarkID="ZAM_A-1">'
+    return f'<?xml version="1.0"?>{head}{text}{signs}</commonRoad>'
 
 
 def lanelet2(lanes: Sequence[Bounds]) -> str:

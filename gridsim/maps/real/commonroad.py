@@ -8,9 +8,12 @@ import numpy as np
 
 from gridsim.maps.real.content import Element
 from gridsim.maps.real.description import Lane, RealRoad, paired, without_repeats
+from gridsim.maps.real.lights import program
 
 NOT_FOR_CARS = {"sidewalk", "crosswalk", "bicycleLane", "busLane", "busStop", "border", "parking", "restricted"}
 LIMIT_SIGNS = {"274", "R2-1", "r301", "maxspeed", "max_speed", "274.1"}  # Germany and Zamunda, USA, Spain, others
+COLOURS = {"red": "r", "redYellow": "r", "yellow": "y"}
+SHORTEST_CYCLE = 20.0  # s; of a shorter one, times are in s, and not in steps
 MARK = "solid"  # a marking that may not be crossed has this in its name
 
 
@@ -24,7 +27,9 @@ def read_commonroad(root: Element) -> RealRoad:
                 limits[sign.get("id")] = value
             elif value > 0.0:
                 unknown.add(kind)
-    lanes, others = {}, 0
+    step = np.nan_to_num(_float(root.get("timeStepSize"))) or 0.1
+    lights = {light.get("id"): _program(light, step) for light in root.iterfind("trafficLight")}
+    lanes, lit, others = {}, {}, 0
     for lanelet in root.iterfind("lanelet"):
         kinds = {kind.text for kind in lanelet.iterfind("laneletType")}
         users = {user.text for user in lanelet.iterfind("userOneWay")} | {
@@ -37,6 +42,7 @@ def read_commonroad(root: Element) -> RealRoad:
         left, right = bounds if len(bounds[0]) == len(bounds[1]) else paired(*map(without_repeats, bounds))
         signs = [limits.get(ref.get("ref")) for ref in lanelet.iterfind("trafficSignRef")]
         found = [limit for limit in (*signs, _float(lanelet.findtext("speedLimit"))) if limit and limit > 0.0]
+        lit[lanelet.get("id", "")] = [lights.get(ref.get("ref"), "") for ref in lanelet.iterfind("trafficLightRef")]
         lanes[lanelet.get("id", "")] = Lane(
             left,
             right,
@@ -45,12 +51,28 @@ def read_commonroad(root: Element) -> RealRoad:
             _neighbour(lanelet, "Left"),
             _neighbour(lanelet, "Right"),
         )
+    for key, lane in lanes.items():  # a lanelet's light is at its end
+        for other in lane.successors:
+            if other in lanes:
+                lanes[other].light = next((each for each in lit[key] if each), lanes[other].light)
     road = RealRoad("CommonRoad", lanes)
     if others:
         road.notes.append(f"{others} lanelets that are not for cars were left out")
     if unknown:
         road.notes.append(f"unknown signs with a number were ignored: {', '.join(sorted(unknown))[:60]}")
     return road
+
+
+def _program(light: Element, step: float) -> str:
+    """`Lane.light` of a traffic light whose times are in steps of so many s; "" for one that is off."""
+    cycle = light.find("cycle")
+    if cycle is None or light.findtext("active", "true") == "false":
+        return ""
+    rows = [(each.findtext("color", ""), _float(each.findtext("duration"))) for each in cycle.iterfind("cycleElement")]
+    if sum(steps for _, steps in rows) * step < SHORTEST_CYCLE:
+        step = 1.0
+    offset = np.nan_to_num(_float(cycle.findtext("timeOffset")))
+    return program([(COLOURS.get(colour, "g"), steps * step) for colour, steps in rows], float(offset) * step)
 
 
 def _neighbour(lanelet: Element, side: str) -> str:

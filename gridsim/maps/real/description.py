@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +23,9 @@ class Lane:
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
     junction: str | None = None  # of the file; "": the lane is outside of junctions; None: the format does not tell
+    links: frozenset[str] = frozenset()  # ways through junctions of the file that it is part of
+    yields: frozenset[str] = frozenset()  # those to which the file has it give way
+    light: str = ""  # the program by which cars enter it: g, y or r for each second, repeated; "": no light
 
     @property
     def centre(self) -> np.ndarray:
@@ -44,6 +48,7 @@ class RealRoad:
     degrees: tuple[
         float, ...
     ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
+    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0 as the lanes lie
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property
@@ -99,7 +104,7 @@ def part_of(lane: Lane, first: float, last: float) -> Lane:
     left, right = (
         np.column_stack([np.interp(at, shares, column) for column in bound.T]) for bound in (lane.left, lane.right)
     )
-    return replace(lane, left=left, right=right, successors=[])
+    return replace(lane, left=left, right=right, successors=[], light="" if first > 0.0 else lane.light)
 
 
 def joined(one: Lane, other: Lane) -> Lane:
@@ -110,7 +115,17 @@ def joined(one: Lane, other: Lane) -> Lane:
     junction = one.junction if one.length > other.length else other.junction
     speed = (one if one.length > other.length else other).speed if speeds else math.nan
     successors = list(other.successors)
-    return replace(one, left=left[kept], right=right[kept], speed=speed, successors=successors, junction=junction)
+    return replace(
+        one,
+        left=left[kept],
+        right=right[kept],
+        speed=speed,
+        successors=successors,
+        junction=junction,
+        links=one.links | other.links,
+        yields=one.yields | other.yields,
+        light=one.light or other.light,
+    )
 
 
 def _without_returns(line: np.ndarray) -> list[int]:
@@ -143,6 +158,15 @@ def groups_of(lanes: dict[str, Lane]) -> list[list[str]]:
             group.append(right)
         done.update(group)
         found.append(group)
+    return found
+
+
+def predecessors(lanes: dict[str, Lane]) -> dict[str, list[str]]:
+    """The lanes that lead to each lane."""
+    found = defaultdict(list)
+    for key, lane in lanes.items():
+        for other in lane.successors:
+            found[other].append(key)
     return found
 
 

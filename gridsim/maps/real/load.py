@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.errors import GridSimError
 from gridsim.jit import CACHE_FOLDER, F, freeze
+from gridsim.maps.lights import no_lights
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network, make_network
 from gridsim.maps.parts import CROP
@@ -28,6 +29,7 @@ from gridsim.maps.real.commonroad import read_commonroad
 from gridsim.maps.real.content import format_of, parse, read_content
 from gridsim.maps.real.description import Lane, RealRoad
 from gridsim.maps.real.lanelet2 import read_lanelet2
+from gridsim.maps.real.lights import with_lights
 from gridsim.maps.real.shape import network_of, resampled, shaped
 from gridsim.maps.real.sumo import convert, read_net
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
@@ -39,21 +41,24 @@ SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
 SLOWEST_LIMIT = 15 / 3.6  # m/s; what is below, no road has: a file has it in a wrong unit
 SPEEDS = 0.45, 0.95  # the interval within which speed counts, as shares of the usual limit
+SIDES = {"right": 1.0, "left": -1.0}
 FASTEST = 27.0  # m/s, of the interval
 
 
-def read_road(path: Path, crop: tuple[float, float, float] | None = None) -> RealRoad:
+def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: float | None = None) -> RealRoad:
     """The roads of a file as it has them, with a crop those in a square: its middle and its side in m.
 
-    The middle is latitude and longitude where the file's places are, else x and y in m.
+    The middle is latitude and longitude where the file's places are, else x and y in m. `hand` is the side on which
+    traffic drives, if the file does not decide it: 1 right, -1 left.
     """
     data = read_content(path)
     root = parse(path, data)
     kind = format_of(path, data, root)
     if kind == "osm":
-        return convert(path, data, kind, root, crop)
+        return convert(path, data, kind, root, crop, hand)
     readers = {"commonroad": read_commonroad, "lanelet2": read_lanelet2, "sumo": read_net}
-    road = readers[kind](root) if kind in readers else convert(path, data, kind, root)
+    road = readers[kind](root) if kind in readers else convert(path, data, kind, root, hand=hand)
+    road.hand = hand or road.hand
     if crop is not None:
         middle = np.array(crop[:2])
         select.cropped(road, (middle[::-1] - road.degrees[:2]) * road.degrees[2:] if road.degrees else middle, crop[2])
@@ -137,10 +142,11 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     # What of a junction lies beyond the lanes that are left would come in again on the other side of the torus.
     inside = (np.clip(road.junctions[key], low - OUTSIDE, high + OUTSIDE) for key in road.junctions if key in used)
     outlines = [outline - origin for outline in inside]
-    hand = hand_of(road.lanes)
+    hand = road.hand or hand_of(road.lanes)
     lanes, conflicts = shaped(road.lanes, gap, size)
     nodes = clearance_of(lanes, outlines, size)
-    network = network_of(lanes, conflicts, hand)
+    road_there = make_road(nodes, (0.0, 1.0), 2.0 * HALF_WALL)
+    network = with_lights(network_of(lanes, conflicts, hand), lanes, road_there)
     limits = np.array([lane.speed for lane in lanes.values()])
     limits[~(limits >= SLOWEST_LIMIT)] = USUAL_LIMIT
     return Prepared(road.format, road.notes, origin, nodes, network, limits)
@@ -164,6 +170,8 @@ def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
 def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
     """The map."""
     network, limits = prepared.network, prepared.limits
+    if not config.traffic.lights:
+        network = network._replace(**no_lights(len(limits)))
     lengths = (np.diff(network.offsets) - 1) * network.steps
     order = np.argsort(limits)
     usual = float(limits[order][np.searchsorted(np.cumsum(lengths[order]), lengths.sum() / 2)])
@@ -174,14 +182,21 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
     return Map(name, 0, road, Strips.of(), make_network(network, road, config, paces))
 
 
-def split_crop(name: str) -> tuple[Path, tuple[float, float, float] | None]:
-    """The path of a scenario's name, and its crop: FILE@LAT,LON,METRES or FILE@X,Y,METRES."""
+def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, float | None]:
+    """The path of a scenario's name, its crop and its side of the road.
+
+    It may end in @LAT,LON,METRES or @X,Y,METRES, and in @left or @right.
+    """
+    side = re.search(r"@(left|right)(?=@|$)", name)
+    if side:
+        name = name[: side.start()] + name[side.end() :]
     found = CROP.fullmatch(name)
     try:
         crop = tuple(map(float, found.groups()[1:])) if found else None
     except ValueError:
         crop, found = None, None
-    return Path(found[1] if found else name), crop  # type: ignore[return-value]
+    path = Path(found[1] if found else name)
+    return path, crop, SIDES[side[1]] if side else None  # type: ignore[return-value]
 
 
 def load_road(name: str, config: SimConfig) -> Map:
@@ -193,7 +208,7 @@ def load_road(name: str, config: SimConfig) -> Map:
 
 def file_digest(name: str) -> str:
     """SHA-256 of a road's file. Raises: GridSimError if it cannot be read."""
-    return hashlib.sha256(read_bytes(split_crop(name)[0])).hexdigest()
+    return hashlib.sha256(read_bytes(split_name(name)[0])).hexdigest()
 
 
 @lru_cache(maxsize=4)
@@ -214,20 +229,20 @@ def gap_of(config: SimConfig) -> float:
 
 def cached(name: str, digest: str, gap: float) -> Path:
     """Where what is made of a file is kept."""
-    key = hashlib.sha256(f"{digest} {split_crop(name)[1]} {gap}".encode()).hexdigest()[:32]
+    key = hashlib.sha256(f"{digest} {split_name(name)[1:]} {gap}".encode()).hexdigest()[:32]
     return CACHE_FOLDER / f"road-{key}.npz"
 
 
 def prepared(name: str, digest: str, gap: float) -> Prepared:
     """What `prepare` makes of a file, from the cache if it is there."""
-    path, crop = split_crop(name)
+    path, crop, hand = split_name(name)
     kept = cached(name, digest, gap)
     try:
         return Prepared.load(kept)
     except (OSError, ValueError, LookupError, zipfile.BadZipFile):
         pass
     try:
-        made = prepare(read_road(path, crop), gap)
+        made = prepare(read_road(path, crop, hand), gap)
     except GridSimError as error:
         raise GridSimError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
     with contextlib.suppress(OSError):

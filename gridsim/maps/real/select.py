@@ -9,12 +9,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from gridsim.jit import njit
-from gridsim.maps.real.description import Lane, RealRoad, groups_of
+from gridsim.maps.real.description import Lane, RealRoad, groups_of, heading, predecessors
 
 TIGHTEST = 3.5  # m, the least radius of a turn that traffic drives
 TURN = 1.75  # rad, 100 degrees: what may be turned within an arc of that radius
 NEARLY = 0.75  # of the largest component's length
 APART = 2.5  # m of height between two ways, at least, of which one is above the other
+JOINT = 0.01  # m of the lanes before and after a lane that are looked at, for their directions
 END = 3.0  # m from a lane's end, within which lanes meet and do not cross
 
 
@@ -41,7 +42,16 @@ def cropped(road: RealRoad, middle: np.ndarray, side: float) -> None:
 
 def without_tight_turns(road: RealRoad) -> None:
     """Leave out lanes that turn more tightly than cars can."""
-    kept = {key for key, lane in road.lanes.items() if not _is_tight(lane.centre[:, :2])}
+    before = predecessors(road.lanes)
+    kept = set()
+    for key, lane in road.lanes.items():
+        line = lane.centre[:, :2]
+        if lane.junction:  # it may be so short that it turns only where it joins others
+            ahead = [heading(road.lanes[k], 0) for k in lane.successors[:1] if k in road.lanes]
+            behind = [heading(road.lanes[k], -1) for k in before[key][:1]]
+            line = np.array([line[0] - JOINT * d for d in behind] + [*line] + [line[-1] + JOINT * d for d in ahead])
+        if not _is_tight(line):
+            kept.add(key)
     if left_out := len(road.lanes) - len(kept):
         road.notes.append(f"{left_out} lanes that turn in less than {TIGHTEST:g} m are not ways of traffic")
     road.lanes = keep(road.lanes, kept)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import FORKS, LANE_STEP
-from gridsim.maps.network import Network
-from gridsim.maps.real.description import Lane, groups_of, joined, part_of
+from gridsim.maps.lights import no_lights
+from gridsim.maps.network import ALWAYS, MOVING, NEVER, Network
+from gridsim.maps.real.description import Lane, groups_of, joined, part_of, predecessors
 from gridsim.maps.real.select import on_rings
 
 APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
@@ -128,15 +129,6 @@ def boxes_of(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.nd
     return (low + high) / 2, (high - low) / 2 + _ROUNDED
 
 
-def predecessors(lanes: dict[str, Lane]) -> dict[str, list[str]]:
-    """The lanes that lead to each lane."""
-    found = defaultdict(list)
-    for key, lane in lanes.items():
-        for other in lane.successors:
-            found[other].append(key)
-    return found
-
-
 def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[str]]) -> list[str] | None:
     """The lanes that alone continue those of a group, in the same order side by side; None if there are none such."""
     onward = [lanes[key].successors for key in group]
@@ -155,7 +147,7 @@ def _merge(lanes: dict[str, Lane], crossed: set[str]) -> None:
     for group in groups_of(lanes):
         while all(key in lanes for key in group):
             onward = _forward(lanes, group, before)
-            if onward is None:
+            if onward is None or any(lanes[key].light for key in onward):
                 break
             together = sum(max(lanes[key].length for key in keys) for keys in (group, onward))
             short = min(lanes[key].length for key in (*group, *onward)) < LEAST
@@ -172,7 +164,7 @@ def _absorb(lanes: dict[str, Lane]) -> None:
     before = predecessors(lanes)
     for key in sorted(lanes, key=lambda name: lanes[name].length):
         lane, first = lanes[key], before[key]
-        if lane.length > APPROACH or key in lane.successors or not first:
+        if lane.length > APPROACH or key in lane.successors or not first or lane.light:
             continue
         limit = LEAST / 2 if not all(_is_alone(lanes[k]) for k in (*first, *lane.successors)) else LEAST
         if lane.length <= APPROACH and all(lanes[p].successors == [key] and _is_alone(lanes[p]) for p in first):
@@ -340,6 +332,9 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
     """Lanes as traffic needs them, and which of them may collide; `gap` (m) between middle lines, size of the torus."""
     lanes = {key: replace(lane, successors=list(lane.successors)) for key, lane in lanes.items()}
     _unlink(lanes, gap)
+    conflicts = Conflicts(lanes, gap, size)
+    for key, lane in lanes.items():
+        lane.light = lane.light if key in conflicts else ""  # where nobody crosses, nobody waits
     for _ in range(3):
         _absorb(lanes)
         conflicts = Conflicts(lanes, gap, size)
@@ -349,6 +344,20 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
         _lengthen(lanes)
         _clear_roads(lanes, Conflicts(lanes, gap, size))
     return lanes, Conflicts(lanes, gap, size)
+
+
+def _yields(lanes: list[Lane], cross: np.ndarray) -> np.ndarray:
+    """`Network.yields` of lanes that conflict; of two that give way to each other, as ways over several junctions may,
+    neither does.
+    """
+    gives_way = np.zeros_like(cross)
+    for k, j in np.argwhere(cross):
+        gives_way[k, j] = not lanes[k].yields.isdisjoint(lanes[j].links)
+    gives_way &= ~gives_way.T
+    _, circle = connected_components(gives_way, connection="strong")
+    in_order = gives_way & (circle[:, None] != circle)
+    kinds = np.where(in_order, ALWAYS, np.where(gives_way, MOVING, NEVER))[cross]
+    return kinds.astype(np.uint8) if kinds.any() else np.zeros(0, dtype=np.uint8)
 
 
 def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Network:
@@ -381,8 +390,10 @@ def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Net
         "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "yields": _yields([*lanes.values()], cross),
         "room": np.zeros(len(points), dtype=np.float32),
         "boxes": np.concatenate(boxes_of(points, offsets), axis=1).astype(np.float32),
+        **no_lights(len(lanes)),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
     width, height = (np.float32(side) for side in conflicts.size)

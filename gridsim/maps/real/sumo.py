@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import tempfile
+from collections import defaultdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,13 +16,16 @@ import numpy as np
 from gridsim.errors import GridSimError
 from gridsim.maps.real.content import INSTALL, Element, parse
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_repeats
+from gridsim.maps.real.lights import program
 
 TIME_LIMIT = 120.0  # s
+COLOURS = {"r": "r", "u": "r", "y": "y", "Y": "y"}  # of a link in a phase; all others are green, or off
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
     "osm": [
         "--keep-edges.by-vclass=passenger", "--geometry.remove", "--junctions.join", "--osm.layer-elevation=6",
         "--default.junctions.radius=6", "--junctions.internal-link-detail=12",
+        "--tls.guess-signals", "--tls.discard-simple",
     ],
     "opendrive": [
         "--keep-edges.by-vclass=passenger", "--opendrive.curve-resolution=0.5", "--output.original-names",
@@ -54,23 +58,31 @@ def keeps_left(latitude: float, longitude: float) -> bool:
 
 
 def convert(
-    path: Path, data: bytes, kind: str, root: Element, crop: tuple[float, float, float] | None = None
+    path: Path,
+    data: bytes,
+    kind: str,
+    root: Element,
+    crop: tuple[float, float, float] | None = None,
+    hand: float | None = None,
 ) -> RealRoad:
-    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part."""
+    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part.
+
+    `hand` decides on which side traffic drives: 1 right, -1 left; None: the file does.
+    """
     options, notes = list(OPTIONS[kind]), []
     if kind == "osm":
         places = np.array([(float(n.get("lat", "nan")), float(n.get("lon", "nan"))) for n in root.iterfind("node")])
         if not len(places):
             raise GridSimError(f"{path}: it has no nodes; is it an extract of OpenStreetMap in XML?")
-        lefthand = keeps_left(*np.nanmedian(places, axis=0))
+        lefthand = keeps_left(*np.nanmedian(places, axis=0)) if hand is None else hand < 0.0
         if crop:
             half = np.array([crop[2], crop[2] / max(math.cos(math.radians(crop[0])), 0.01)]) / 2 / METRES_PER_DEGREE
             (south, west), (north, east) = crop[:2] - half, crop[:2] + half
             options.append(f"--keep-edges.in-geo-boundary={west},{south},{east},{north}")
-        if lefthand:
+        if lefthand and hand is None:
             notes.append("traffic keeps left, as the country of the coordinates does")
     else:
-        lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data
+        lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data if hand is None else hand < 0.0
     # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
     # what it makes of the file as one that keeps right is right but for the direction.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
@@ -79,6 +91,7 @@ def convert(
     road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else None)
     if turned:
         _turn_round(road)
+    road.hand = -1.0 if lefthand else 1.0
     road.format, road.notes = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE"}[kind], notes + road.notes
     return road
 
@@ -176,6 +189,8 @@ def _add_connections(
         for c in root.iterfind("connection")
         if c.get("from", "").startswith(":")
     }
+    programs = {logic.get("id"): _program(logic) for logic in root.iterfind("tlLogic")}
+    yields = _right_of_way(root)
     leads_to = {edge.get("id", ""): edge.get("to", "") for edge in root.iterfind("edge")}
     turns = 0
     for number, connection in enumerate(root.iterfind("connection")):
@@ -202,10 +217,48 @@ def _add_connections(
         name = f"{ends[0]}>{ends[1]}#{number}"
         width = min(np.hypot(*(lane.left - lane.right)[at, :2]) for lane, at in ((one, -1), (other, 0)))
         junction = leads_to[connection.get("from", "")]
-        road.lanes[name] = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction)
+        columns = programs.get(connection.get("tl"), [])
+        link = int(connection.get("linkIndex", "-1"))
+        light = columns[link] if 0 <= link < len(columns) else ""
+        way = _name(connection)
+        lane = Lane(*bounds_of(line, float(width)), speed, [ends[1]], junction=junction, light=light)
+        lane.links, lane.yields = frozenset([way]), yields.get(way, frozenset())
+        road.lanes[name] = lane
         one.successors.append(name)
     if turns:
         road.notes.append(f"{turns} U-turns are not ways of traffic")
+
+
+def _name(connection: Element) -> str:
+    ends = ("from", "fromLane", "to", "toLane")
+    return " ".join(connection.get(end, "") for end in ends)
+
+
+def _right_of_way(root: Element) -> dict[str, frozenset[str]]:
+    """To which connections each has to give way: junctions number theirs by the lanes that lead to them."""
+    of_lane, yields = defaultdict(list), {}
+    for connection in root.iterfind("connection"):
+        of_lane[f"{connection.get('from')}_{connection.get('fromLane')}"].append(_name(connection))
+    for junction in root.iterfind("junction"):
+        names = [name for lane in junction.get("incLanes", "").split() for name in of_lane[lane]]
+        for request in junction.iterfind("request"):
+            answers = request.get("response", "")[::-1]
+            index = int(request.get("index", "-1"))
+            if 0 <= index < len(names):
+                others = (name for name, answer in zip(names, answers, strict=False) if answer == "1")
+                yields[names[index]] = frozenset(others)
+    return yields
+
+
+def _program(logic: Element) -> list[str]:
+    """For each link of a traffic light, `Lane.light`."""
+    phases = [(phase.get("state", ""), float(phase.get("duration", "0"))) for phase in logic.iterfind("phase")]
+    links = min((len(state) for state, _ in phases), default=0)
+    colours = [[COLOURS.get(state[link], "g") for state, _ in phases] for link in range(links)]
+    return [
+        program([*zip(column, (t for _, t in phases), strict=True)], float(logic.get("offset", "0")))
+        for column in colours
+    ]
 
 
 def _curve(start: np.ndarray, end: np.ndarray) -> np.ndarray:

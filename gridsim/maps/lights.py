@@ -1,0 +1,90 @@
+"""Traffic lights: programs that repeat, and the stop lines that they close. A network without lines has none.
+
+A stop line is a wall that only those see who drive towards it, while its light is not green, and that they must not
+cross while it is red. It reaches across the road, so that nobody passes beside it. All lights of a map share one clock,
+`state.CLOCK`, whose beginning follows from an episode's start: the same start has the same lights, whoever drives.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gridsim.counter import mix
+from gridsim.jit import ZERO, F, I, U, leaf
+from gridsim.maps.network import Network, wrapped, wrapped_any
+from gridsim.state import CLOCK, COS, POSE, SIN, X, Y
+
+GO, CLEARING, STOP = 0, 1, 2  # green; yellow: those who cannot stop any more may go; red
+NO_LINE = F(1e9)  # m, the way to a stop line where there is none
+
+
+def no_lights(lanes: int) -> dict[str, Any]:
+    """The part of a Network with so many lanes that says that it has no lights."""
+    return {
+        "lines": np.zeros((0, 5), dtype=np.float32),
+        "signals": np.full(lanes, -1, dtype=np.int32),
+        "program_offsets": np.zeros(1, dtype=np.int32),
+        "programs": np.zeros(0, dtype=np.uint8),
+    }
+
+
+def programs_of_lines(network: Network) -> list[np.ndarray]:
+    """The program of each stop line: what it shows in each second."""
+    return [network.programs[slice(*network.program_offsets[k : k + 2])] for k in range(len(network.lines))]
+
+
+@leaf
+def light(network, program, seconds):
+    """What a program shows at a time: GO, CLEARING or STOP."""
+    program = U(program)
+    first = network.program_offsets[program]
+    cycle = network.program_offsets[program + U(1)] - first
+    return I(network.programs[U(first + I(seconds) % cycle)])
+
+
+@leaf
+def set_clock(network, start, car):
+    """Set the lights' clock for a car at `start`: to the one that the start has, or to one drawn from its place."""
+    if network.lines.shape[0] > 0:
+        goes_on = start.shape[0] > POSE + 2 and start[POSE + 2] > ZERO
+        drawn = mix(mix(U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))))
+        car[CLOCK] = start[POSE + 2] if goes_on else F(drawn >> U(48)) + F(1.0)
+
+
+@leaf
+def way_to_line(network, seconds, least, x, y, cosine, sine):
+    """Way (m) straight ahead to the first stop line whose light shows `least` or more; NO_LINE if there is none."""
+    best = NO_LINE
+    for k in range(network.lines.shape[0]):
+        line = network.lines[k]
+        dx, dy = wrapped(line[0] - x, network.width), wrapped(line[1] - y, network.height)
+        ahead, along = dx * line[2] + dy * line[3], cosine * line[2] + sine * line[3]
+        if ahead > ZERO and along > ZERO and ahead < best * along:
+            way = ahead / along
+            aside = way * (sine * line[2] - cosine * line[3]) - (dy * line[2] - dx * line[3])
+            if abs(aside) <= line[4] and light(network, k, seconds) >= least:
+                best = way
+    return best
+
+
+@leaf
+def crosses_line(network, seconds, car, front, x, y, cosine, sine):
+    """Whether a car's front, `front` m ahead of its middle, crosses the stop line of a red light.
+
+    Its way is from the car's state to a pose near by, which need not be wrapped over the torus.
+    """
+    from_x, from_y = car[X] + front * car[COS], car[Y] + front * car[SIN]
+    to_x, to_y = x + front * cosine, y + front * sine
+    for k in range(network.lines.shape[0]):
+        line = network.lines[k]
+        ax, ay = wrapped_any(from_x - line[0], network.width), wrapped_any(from_y - line[1], network.height)
+        bx, by = ax + (to_x - from_x), ay + (to_y - from_y)
+        before, after = ax * line[2] + ay * line[3], bx * line[2] + by * line[3]
+        if before < ZERO and after >= ZERO:
+            share = before / (before - after)
+            x_there, y_there = ax + share * (bx - ax), ay + share * (by - ay)
+            if abs(y_there * line[2] - x_there * line[3]) <= line[4] and light(network, k, seconds) == STOP:
+                return True
+    return False
