@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import math
 import os
+import re
 import tempfile
 import zipfile
 from dataclasses import dataclass
