@@ -35,6 +35,7 @@ from gridsim.traffic.world import check_traffic
 
 MAX_TRAFFIC = 100
 MAX_STEPS = 10**15  # car-steps or episodes
+SETTLED = 40  # generation from which steps shrink in traffic, by measurement
 LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
@@ -247,8 +248,9 @@ class EvolveSettings(RunSettings):
     def search_config(self) -> SearchConfig:
         """The search's parameters."""
         return SearchConfig(
-            self.population, self.curriculum().groups, self.tournament, self.sigma, self.elites, self.mutation_rate
-        )
+            self.population, self.curriculum().groups, self.tournament, self.sigma,
+            SETTLED if any(self.crowds) else 0, self.elites, self.mutation_rate,
+        )  # fmt: skip
 
     def curriculum(self) -> CurriculumConfig:
         usual = super().curriculum()

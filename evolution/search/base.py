@@ -16,12 +16,15 @@ from gridsim.errors import GridSimError
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Parameters of a search; only `two_parents` uses `elites` and `mutation_rate`."""
+    """Parameters of a search; only `two_parents` uses `elites` and `mutation_rate`, and not `settled`."""
 
     population: int = 256  # members of a generation
     groups: int = 8  # of members; each group has its own episodes
     tournament: int = 4  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of the space's scales
+    # Where chance decides much, the generation from which the centre's steps shrink, with the square root of
+    # generations, and its average spans more of them: else chance undoes what was learned. 0: never.
+    settled: int = 0
     elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate
 

@@ -20,9 +20,6 @@ _CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
 _ELITES = 2  # the centre, and the champion or, before the first one, the average
 _LEARNING_RATE = 2.0  # of the mean, c_m of Hansen 2016 ("The CMA Evolution Strategy: A Tutorial"), by measurement
 _KEPT = 0.9  # decay of the average of centres in each generation
-# From this generation on, the centre's steps shrink with the square root of generations, and the average spans more and
-# more of them: what chance does to a centre no longer undoes what it has learned.
-_SETTLED = 40
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
 _MAX_GROWTH = 2.0
@@ -77,7 +74,7 @@ class Recombination(Search):
         genes, shift = len(self._free), plus - minus
         noise = noise_sum(np.arange(pairs), shift, asked.key, self.space)
         towards = self.sigma * noise + weights[1] * (asked.parents[_OTHER] - self.centre)
-        age = max(1.0, self.generation / _SETTLED)
+        age = max(1.0, self.generation / self.config.settled) if self.config.settled else 1.0
         self.centre = self.centre + _LEARNING_RATE / math.sqrt(age) * towards
         kept = 1.0 - (1.0 - _KEPT) / age
         self.average = kept * self.average + (1.0 - kept) * self.centre
