@@ -1,9 +1,9 @@
 """The curriculum: the episodes of each generation, and validation, which chooses the champion.
 
 Episodes begin short, since at first the best members drive into the first bend at full speed, and their length doubles
-when the leader (the best genome known before a generation) succeeds. Half of them start shortly before a crash of a
-recent leader, mostly where half of the members crash again: there is most to learn. Each group of a generation has its
-own, so that selection uses many although each member drives few. Where there are several roads, they take turns.
+when the leader (the best genome known before a generation) succeeds. Half of them, in traffic most, start shortly
+before a crash of an earlier leader, mostly where half of the members crash again: there is most to learn. Each group of
+a generation has its own, so that selection uses many although each member drives few. Several roads take turns.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """

@@ -16,7 +16,7 @@ from gridsim.errors import GridSimError
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Parameters of a search; only `two_parents` uses `elites` and `mutation_rate`, and not `settled`."""
+    """Parameters of a search; `elites` and `mutation_rate` are for `two_parents`, `settled` is for `recombination`."""
 
     population: int = 256  # members of a generation
     groups: int = 8  # of members; each group has its own episodes
