@@ -76,8 +76,8 @@ def spread_starts(
 ) -> Episodes:
     """Full episodes, as many on each road, one road after the other: on its maps of its own `seeds` in turn.
 
-    A road's depend only on the road and the arguments, not on the other roads. Args: other cars on each road; for how
-    many there is `room` in an episode, if that is more.
+    A road's episodes are the same whichever other roads there are. Args: `crowds`, the number of other cars on each
+    road; `room`, the least number of cars in the arrays, as in `lane_starts`.
     """
     used, roads = np.arange(episodes) % len(seeds), list[Episodes]()
     for k, traffic in enumerate(crowds):

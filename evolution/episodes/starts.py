@@ -41,8 +41,8 @@ def lane_starts(
     """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
     They have the configuration's target and time limit.
-    Args: other cars, the same number on all maps or one for each; for how many there is `room`, if that is more: the
-    others are absent (LANE is -1).
+    Args: `traffic`, one number for all maps or one for each; `room`, the least number of cars in the arrays, of which
+    those beyond `traffic` are absent (LANE is -1).
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), cars, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()

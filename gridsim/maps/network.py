@@ -13,7 +13,8 @@ from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
-# To no car; to one that moves, as where four roads give way to one another in a circle; also to one that stands.
+# To which cars of a crossing lane one gives way: none; those that move (where four roads give way to one another in a
+# circle); all, also those that stand.
 NEVER, MOVING, ALWAYS = YIELDS = 0, 1, 2
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
