@@ -70,7 +70,7 @@ class RunSettings(ABC):
     policy: Annotated[str, IN_WORDS] = ""
     """Network; by default one that suits the observation."""
     car_steps: Annotated[int, IN_WORDS] = 0
-    """Car-steps at most; the last generation may exceed it. By default 60 million, and any number with
+    """Car-steps at most; the last generation may exceed it. By default 60 million a road, and any number with
     --generations."""
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never. With
@@ -234,7 +234,7 @@ class EvolveSettings(RunSettings):
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
             "population": SearchConfig.population if alone else 128,
-            "car_steps": 0 if self.generations else 60_000_000,
+            "car_steps": 0 if self.generations else 60_000_000 * len(self.crowds),
         }
 
     @property
