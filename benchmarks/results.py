@@ -1,12 +1,13 @@
 """Measure the tables of docs/results.md: python benchmarks/results.py [TABLE ...] [--output DIR] [--quick] [--write]
 
-Each command is run as a user would run it and timed from start to exit; then its champion drives 512 held-out drives. A
-row is one command, or one with several seeds: their median, and the worst of them in brackets. Results are kept in DIR,
-one JSON file per command; they are measured again only after a change of gridsim, evolution or cluster. So an
-interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
+Each command is run as a user would run it and timed from start to exit; then its champion drives 1,024 held-out
+drives. A row is one command, or one with several seeds: their median, and the worst of them in brackets. Results are
+kept in DIR, one JSON file per command; they are measured again only after a change of gridsim, evolution or cluster. So
+an interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
 commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, speed, learners, comparison, pace; all by default, in two and a half hours on two cores.
+Tables: seeds, roads, compute, compute16, all, other, speed, learners, comparison, pace; all by default, in some four
+hours on two cores.
 """
 
 from __future__ import annotations
@@ -32,13 +33,15 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "results.md"
 PRODUCT = ("gridsim", "evolution", "cluster")
 BIN = Path(sys.executable).parent
-EPISODES = 512  # held-out drives of each champion
-SEEDS, SEEDS_IN_TRAFFIC = 8, 3
+EPISODES = 1024  # held-out drives of each champion
+SEEDS, SEEDS_IN_TRAFFIC = 5, 3
+BUDGETS = {"--car-steps 15e6": 3, "--compute 1": 3, "--compute 4": 1}  # and seeds; on `seamless` all have three
 GOOD = 0.95  # of validation
 ROADS = (
     ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
-    ("highway", 8), ("curved", 6), ("seamless", 6), ("roundabout", 4), ("city", 6),
+    ("highway", 8),
 )  # fmt: skip
+CROWDED = {"seamless": 6, "curved": 6, "roundabout": 4, "city": 6}  # roads on which failures are not rare
 PACES = {"highway": 20, "curved": 10, "seamless": 9, "roundabout": 7, "city": 6}  # m/s, nearer to the reference driver
 
 
@@ -62,6 +65,17 @@ TABLES: dict[str, dict[str, list[str]]] = {
             f"gridsim-evolve --scenario {road} --traffic {cars}", SEEDS_IN_TRAFFIC if cars else SEEDS
         ).items()
     },
+    "compute": {
+        label: commands
+        for road, cars in CROWDED.items()
+        for budget, seeds in BUDGETS.items()
+        for label, commands in over_seeds(
+            f"gridsim-evolve --scenario {road} --traffic {cars} --until 2 {budget}",
+            SEEDS_IN_TRAFFIC if road == "seamless" or seeds > 1 else 1,
+        ).items()
+    },
+    "compute16": alone("gridsim-evolve --scenario seamless --traffic 6 --until 2 --compute 16"),
+    "all": over_seeds("gridsim-evolve --scenario all --wall-time 300", SEEDS_IN_TRAFFIC),
     "other": {
         **over_seeds("gridsim-evolve --policy mlp:6,7", 5),
         **alone("gridsim-evolve --recombination two", "gridsim-evolve --scenario curved --observation grid"),
@@ -77,10 +91,11 @@ TABLES: dict[str, dict[str, list[str]]] = {
     },
 }
 HEAD = (
-    "| command | seeds | car-steps, million | to 95 % of validation | total time, s | success, % | collisions, % "
+    "| command | seeds | car-steps, million | to 95 % of validation | total time, s | success, % | km per collision "
     "| speed, m/s |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
+HEAD_OF_ROADS = "| road | seeds | success, % | km per collision | speed, m/s |\n| --- | ---: | ---: | ---: | ---: |"
 
 
 @dataclass(frozen=True)
@@ -123,19 +138,26 @@ def call(command: str, *more: str) -> str:
     return subprocess.run([*begin, *flags, *more], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def measure_run(command: str, store: Store) -> dict[str, Any]:
-    """Run a learner, and drive its champion."""
+def begin(command: str, store: Store, *more: str) -> Path:
+    """Run a learner; returns its folder."""
     name = f"{name_of(command)}-{int(time.time())}"
     store.folder.mkdir(parents=True, exist_ok=True)
+    log = f"sqlite:///{store.folder / 'mlflow.db'}"
+    call(command, "--output", str(store.folder), "--name", name, "--tracking-uri", log, *more)
+    return store.folder / name
+
+
+def drive(run: Path) -> dict[str, float]:
+    """The figures of a run's champion in held-out drives."""
+    return json.loads(call("gridsim-evaluate", str(run), "--episodes", str(EPISODES), "--json"))
+
+
+def measure_run(command: str, store: Store) -> dict[str, Any]:
+    """Run a learner, and drive its champion."""
     started = time.perf_counter()
-    call(
-        command, "--workers", "2", "--output", str(store.folder), "--name", name,
-        "--tracking-uri", f"sqlite:///{store.folder / 'mlflow.db'}",
-    )  # fmt: skip
+    run = begin(command, store)
     seconds = time.perf_counter() - started
-    run = store.folder / name
-    held_out = json.loads(call("gridsim-evaluate", str(run), "--episodes", str(EPISODES), "--json"))
-    summary = json.loads((run / "summary.json").read_text())
+    held_out, summary = drive(run), json.loads((run / "summary.json").read_text())
     return {
         "seconds": seconds,
         "car_steps": summary["car_steps"],
@@ -195,24 +217,59 @@ def render(rows: Mapping[str, Sequence[str]], store: Store) -> str | None:
         return "\n".join(
             ["| figure | value |", "| --- | ---: |", *(f"| `{k}` | {v:,.2f} |" for k, v in figures.items())]
         )
+    if "by_road" in firsts[0]["held_out"]:
+        return "\n".join([HEAD_OF_ROADS, *(row for runs in whole.values() for row in rows_of_roads(runs))])
     return "\n".join([HEAD, *(row_of(label, runs) for label, runs in whole.items())])
+
+
+def cell(values: Iterable[float], worst: Callable[[list[float]], float] | None, digits: int) -> str:
+    """One value, or the median and the worst of several."""
+    values = list(values)
+    median = f"{statistics.median(values):,.{digits}f}"
+    return median if len(values) == 1 or worst is None else f"{median} ({worst(values):,.{digits}f})"
+
+
+def rows_of_roads(runs: Sequence[dict[str, Any]]) -> Iterable[str]:
+    """A row for each road of runs on several, and one for all."""
+    for road in (*runs[0]["held_out"]["by_road"], "all"):
+        driven = [run["held_out"]["by_road"].get(road, run["held_out"]) for run in runs]
+        yield (
+            f"| {road} | {len(runs)} | {cell((100 * each['success_rate'] for each in driven), min, 1)} | "
+            f"{cell((each['km_per_collision'] for each in driven), min, 0)} | "
+            f"{cell((each['speed_mps'] for each in driven), None, 1)} |"
+        )
+
+
+def draw_compute(rows: Mapping[str, Sequence[str]], store: Store, path: Path) -> None:
+    """Draw failures against car-steps: a point for each run, and a line through the medians of each road."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for k, road in enumerate(CROWDED):
+        medians = []
+        for commands in (commands for label, commands in rows.items() if f"--scenario {road} " in label):
+            runs = [measured for command in commands if (measured := store.kept(command))]
+            million = [run["car_steps"] / 1e6 for run in runs]
+            failures = [EPISODES * (1.0 - run["held_out"]["success_rate"]) for run in runs]
+            axes.plot(million, failures, ".", color=f"C{k}")
+            medians.append((statistics.median(million), statistics.median(failures)))
+        axes.plot(*zip(*medians, strict=True), color=f"C{k}", label=road)
+    axes.set(xscale="log", yscale="log", xlabel="million car-steps", ylabel=f"failures of {EPISODES:,} held-out drives")
+    axes.grid(alpha=0.25, which="both")
+    axes.legend()
+    figure.savefig(path, dpi=110)
 
 
 def row_of(label: str, runs: Sequence[dict[str, Any]]) -> str:
     """A row: values of one run, or medians and the worst of several."""
-
-    def cell(values: Iterable[float], worst: Callable[[list[float]], float] | None, digits: int) -> str:
-        values = list(values)
-        median = f"{statistics.median(values):.{digits}f}"
-        return median if len(values) == 1 or worst is None else f"{median} ({worst(values):.{digits}f})"
-
     held_out = [run["held_out"] for run in runs]
     return (
         f"| `{label}` | {len(runs)} | {cell((run['car_steps'] / 1e6 for run in runs), max, 1)} | "
         f"{cell((run['car_steps_to_good'] / 1e6 for run in runs), max, 1)} | "
         f"{cell((run['seconds'] for run in runs), max, 0)} | "
         f"{cell((100 * drives['success_rate'] for drives in held_out), min, 1)} | "
-        f"{cell((100 * drives['collision_rate'] for drives in held_out), max, 1)} | "
+        f"{cell((drives['km_per_collision'] for drives in held_out), min, 0)} | "
         f"{cell((drives['speed_mps'] for drives in held_out), None, 1)} |"
     )
 
@@ -227,6 +284,8 @@ def write(store: Store) -> None:
             text = f"{text}\n\nMeasured at commit {store.commit}."
             page = re.sub(f"(?s){marks[0]}.*{marks[1]}", lambda _: f"{marks[0]}\n{text}\n{marks[1]}", page)  # noqa: B023
     PAGE.write_text(page)
+    if render(TABLES["compute"], store):
+        draw_compute(TABLES["compute"] | TABLES["compute16"], store, PAGE.parent / "compute.png")
     for command in TABLES["comparison"]:
         if kept := store.kept(command):
             shutil.copy(Path(kept["comparison"]) / "comparison.png", PAGE.parent)

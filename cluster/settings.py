@@ -36,6 +36,7 @@ from gridsim.traffic.world import check_traffic
 MAX_TRAFFIC = 100
 MAX_STEPS = 10**15  # car-steps or episodes
 SETTLED = 40  # generation from which steps shrink in traffic, by measurement
+LIMIT = "+limit"  # what a network sees besides where there are several roads, so that it tells a highway from a city
 LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
@@ -194,11 +195,15 @@ class EvolveSettings(RunSettings):
     step_name: ClassVar[str] = "generation"
     verb: ClassVar[str] = "evolving"
 
+    compute: int = 1
+    """How many times the usual compute: car-steps grow with it, population and validation with its square root. For a
+    cluster, about its workers divided by two; the champion depends on this number, not on the workers."""
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
-    +steering to see its own steering angle, +route to see where a route leads that it has to follow; by default
-    mlp:64+steering, in traffic mlp:128+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of
-    two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    +steering to see its own steering angle, +route to see where a route leads that it has to follow, +limit to see the
+    road's speed limit; by default mlp:64+steering, in traffic mlp:128+motion+steering, on several roads with +limit
+    (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of a dense layer and the
+    number of frames, by default cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
@@ -231,10 +236,12 @@ class EvolveSettings(RunSettings):
     def defaults(self) -> dict[str, Any]:
         alone = not any(self.crowds)
         rays = "mlp:64+steering" if alone else "mlp:128+motion+steering"
+        rays += LIMIT * (len(self.crowds) > 1)
+        usual = SearchConfig.population if alone else 128
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
-            "population": SearchConfig.population if alone else 128,
-            "car_steps": 0 if self.generations else 60_000_000 * len(self.crowds),
+            "population": round(usual * math.sqrt(max(self.compute, 1))),
+            "car_steps": 0 if self.generations else 60_000_000 * max(self.compute, 1) * len(self.crowds),
         }
 
     @property
@@ -254,7 +261,8 @@ class EvolveSettings(RunSettings):
 
     def curriculum(self) -> CurriculumConfig:
         usual = super().curriculum()
-        return replace(usual, groups=max(1, min(usual.groups, self.population // LEAST_GROUP)))
+        groups = max(1, min(usual.groups, self.population // LEAST_GROUP))
+        return replace(usual, groups=groups, validation=round(usual.validation * math.sqrt(self.compute)))
 
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations
@@ -270,6 +278,7 @@ class EvolveSettings(RunSettings):
         if PolicySpec.parse(self.policy).actions != self.actions:
             raise GridSimError(f"policy {self.policy} sets pedal and wheel; give --actions continuous, too")
         self._check_range(0, MAX_STEPS, "generations")
+        self._check_range(1, 10_000, "compute")
         self._check_range(4, 1_000_000, "population")
         self._check_range(0, 1, "mutation_rate")
         classic = self.recombination == "two" or self.search == "random"
@@ -292,8 +301,8 @@ class DqnSettings(RunSettings):
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network of the Q function: mlp: and the sizes of its hidden layers, and what else it sees as for gridsim-evolve,
-    by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
-    layer and the number of frames, by default cnn:16,32,256@4."""
+    by default mlp:64,64+steering, on several roads with +limit; on the grid cnn: with the channels of two
+    convolutions, the units of a dense layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
     """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""
     episodes: Annotated[int, IN_WORDS] = 0
@@ -334,7 +343,8 @@ class DqnSettings(RunSettings):
                 "anneal": 4_000_000, "target_period": 500, "evaluate_every": 250_000,
             }  # fmt: skip
         return {
-            "policy": "mlp:64,64+steering", "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3,
+            "policy": "mlp:64,64+steering" + LIMIT * (len(self.crowds) > 1),
+            "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3,
             "anneal": 30_000_000, "target_period": 200, "evaluate_every": 1_000_000,
         }  # fmt: skip
 

@@ -38,7 +38,7 @@ from cluster.commands.entry import STARTED
 from cluster.commands.progress import RunDisplay
 from cluster.commands.tables import driving_table, errors_table, stress_table
 from cluster.compare.results import series
-from cluster.report import stress
+from cluster.report import stress, suite
 from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.stopping import INTERRUPTED
@@ -52,9 +52,10 @@ from cluster.tracking.tracking import saved_run_id, saved_uri, sync
 from cluster.workers.address import cluster_address
 from evolution.episodes.figures import summarise
 from evolution.networks.policy import PolicySpec
+from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.parts import is_map_file
-from gridsim.maps.scenarios import Traffic, has_lanes, label
+from gridsim.maps.scenarios import REGISTRY, Traffic, has_lanes, label
 from gridsim.reference import errors
 
 
@@ -125,6 +126,9 @@ class EvaluateFlags(RoadFlags):
     stress: bool = False
     """Also drive it with more and more noise, dropped readings, latency and ever less grip: a table, and stress.png
     beside the champion."""
+    suite: bool = False
+    """Drive the suite: all five roads with usual traffic, 512 drives each, the same for everybody. Writes suite.json
+    beside the champion, or checks the one that is there (docs/results.md)."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -302,6 +306,8 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
 
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
+    if flags.suite:
+        return _evaluate_suite(flags)
     champion = load_champion(flags.champion).in_sim(flags.sim)
     name, episode = flags.scenario or champion.scenario, champion.sim.episode
     chosen = (name, flags.episodes, flags.seed, flags.asked)
@@ -330,6 +336,32 @@ def _evaluate() -> int:
         new_console().print(errors_table("Errors against the reference driver", missed))
     if found:
         new_console().print(stress_table(found), f"picture: {short_path(picture)}", sep="\n", soft_wrap=True)
+    return 0
+
+
+def _evaluate_suite(flags: EvaluateFlags) -> int:
+    """Drive the suite, print its table, and keep suite.json beside the champion."""
+    usual = EvaluateFlags(flags.champion, suite=True, json=flags.json)
+    if other := [f.name for f in dataclasses.fields(flags) if getattr(flags, f.name) != getattr(usual, f.name)]:
+        raise GridSimError(f"--suite is the same for everybody; leave out {as_flag(other[0])}")
+    champion, place = load_champion(flags.champion), Path(flags.champion)
+    path = (place if place.is_dir() else place.parent) / suite.FILE
+    before = suite.earlier(path)
+    shown = new_console(stderr=True)
+    roads = track(
+        suite.drive(champion), "driving the suite", len(REGISTRY), console=shown, transient=True, disable=flags.json
+    )
+    driven = list(roads)
+    found = suite.report(champion, driven)
+    checked = suite.compared(before, found)
+    write_json(path, found)
+    if flags.json:
+        print(json.dumps(found))
+        return 0
+    title, crowds = f"{flags.champion} in suite {suite.NUMBER}", [cars for _, cars, _ in driven]
+    new_console().print(driving_table(title, found, found["by_road"], crowds, SimConfig().episode.target))
+    line = f"digest {found['digest'][:16]}, champion {champion.sha256[:16]}: {short_path(path)}"
+    new_console().print(line, *filter(None, [checked]), sep="\n", soft_wrap=True)
     return 0
 
 

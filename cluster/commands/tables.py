@@ -27,7 +27,7 @@ def driving_table(
     rows = list(zip(roads, map(str, crowds), roads.values(), strict=True))
     for road, cars, row in [*rows, ("all", "", figures)]:
         success, collisions = row["success_rate"], row["collision_rate"]
-        other, speed = f"{1.0 - success - collisions:.1%}", f"{row['speed_mps']:.2f}"
+        other, speed = _rest(row), f"{row['speed_mps']:.2f}"
         last = road == rows[-1][0]
         shares = f"{success:.1%}", km_per_collision(row), speed, f"{collisions:.1%}", other
         table.add_row(road, cars, *shares, end_section=last)
@@ -43,8 +43,13 @@ def _one_road(title: str, figures: Mapping[str, float], target: float) -> Table:
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")
     table.add_row("kilometres per collision", km_per_collision(figures))
-    table.add_row("stopped, astray, or out of time", f"{1.0 - figures['success_rate'] - figures['collision_rate']:.1%}")
+    table.add_row("stopped, astray, or out of time", _rest(figures))
     return table
+
+
+def _rest(figures: Mapping[str, float]) -> str:
+    """The share of episodes that neither succeed nor collide."""
+    return f"{abs(round(1.0 - figures['success_rate'] - figures['collision_rate'], 6)):.1%}"
 
 
 def errors_table(title: str, figures: Mapping[str, float]) -> Table:

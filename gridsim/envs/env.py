@@ -4,8 +4,9 @@ Observation:
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
   between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
-  the steering angle as a share of 27 degrees, and `route` four points of a route ahead, float32 [8]
-  (`gridsim.sensing.route`). `gridsim.sensing.observation` has these features.
+  the steering angle as a share of 27 degrees, `route` four points of a route ahead, float32 [8]
+  (`gridsim.sensing.route`), and `limit` the road's speed limit as a share of 30 m/s. `gridsim.sensing.observation` has
+  these features.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
@@ -107,7 +108,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
             config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
-            features: which of `motion`, `steering` and `route` rays come with.
+            features: which of `motion`, `steering`, `route` and `limit` rays come with.
         """
         check_name(scenario := full_name(scenario))
         for name, value, known in (

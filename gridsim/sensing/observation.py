@@ -46,6 +46,7 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("steering", 1, k.steering_limit, F(0.5), mirror=-1.0, sees="its own steering angle"),
         Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
         Feature("route", len(AHEAD), ONE, ONE, mirror=-1.0, reversed=False, sees="a route to follow"),
+        Feature("limit", 1, *speed, shift=-1.0, sees="the road's speed limit"),
     )
 
 
@@ -119,6 +120,7 @@ def observe(simulation, car, world, ranges, closing, observation):
         route.read(simulation, car, values)
         _put(encoding, ROUTE, values, observation)
         _put(encoding, ROUTE + 1, values[len(AHEAD) :], observation)
+    _put(encoding, 6, (simulation.road.speed_high,), observation)
 
 
 @exact

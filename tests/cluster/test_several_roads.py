@@ -14,7 +14,7 @@ from cluster.commands.cli import dqn_main, evaluate_main, evolve_main
 from cluster.commands.watch import watch_main
 from cluster.learn.evolution import Evolution
 from cluster.learn.maps import Maps
-from cluster.settings import EvolveSettings
+from cluster.settings import DqnSettings, EvolveSettings
 from cluster.store.champion import load_champion
 from cluster.tracking.description import held_out_metrics
 from evolution.episodes.curriculum import FINAL_SEEDS, spread_starts
@@ -55,11 +55,9 @@ def roads_of_episodes(episodes):
 
 
 def test_settings_of_several_roads_have_usual_traffic_and_the_network_for_it():
-    assert (SETTINGS.scenario, SETTINGS.traffic, SETTINGS.policy) == (
-        ",".join(ROADS),
-        "usual",
-        "mlp:128+motion+steering",
-    )
+    network = "mlp:128+motion+steering+limit"  # one driver has to tell a highway from a city
+    assert (SETTINGS.scenario, SETTINGS.traffic, SETTINGS.policy) == (",".join(ROADS), "usual", network)
+    assert DqnSettings("all").policy == "mlp:64,64+steering+limit"
     alone = [EvolveSettings(road, "usual", population=64).curriculum() for road in ROADS]
     assert SETTINGS.curriculum().pace == tuple(each.pace[0] for each in alone)
     assert SETTINGS.curriculum().champion_pace == tuple(each.champion_pace[0] for each in alone)

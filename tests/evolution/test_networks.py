@@ -208,10 +208,10 @@ def in_a_mirror(spec, observations):
     seen[:, :RAYS] = observations[:, RAYS - 1 :: -1]
     if "motion" in spec.features:
         seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
-    first = spec.inputs
+    first = spec.inputs - ("limit" in spec.features)
     if "route" in spec.features:  # points, how far ahead and then how far to the left
+        seen[:, first - 4 : first] = -observations[:, first - 4 : first]
         first -= 8
-        seen[:, -4:] = -observations[:, -4:]
     if "steering" in spec.features:
         seen[:, first - 1] = -observations[:, first - 1]
     return seen

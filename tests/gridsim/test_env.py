@@ -179,8 +179,8 @@ def test_grids_are_what_the_last_rays_say_and_begin_anew_with_an_episode(
     assert {part.dtype.kind for part in info.values()} == set("bfu")  # numbers alone, as Gymnasium's NumpyToTorch wants
 
 
-def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
-    env = GridSimVectorEnv(8, scenario="highway", maps=maps["highway"], motion=True, steering=True)
+def test_rays_motion_speed_steering_and_limit_are_shares(maps: Maps) -> None:
+    env = GridSimVectorEnv(8, scenario="highway", maps=maps["highway"], motion=True, steering=True, limit=True)
     env.reset(seed=0)
     fastest = 0.0  # m/s at which a car came closer
     for step in range(200):
@@ -191,6 +191,7 @@ def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
         np.testing.assert_allclose(seen[:, 31:62] * 30.0, np.clip(env.simulator.closing, -30.0, 30.0), atol=1e-5)
         np.testing.assert_allclose(seen[:, 62] * 30.0, info["speed_mps"], rtol=1e-6)
         np.testing.assert_allclose(seen[:, 63] * 27.0, np.degrees(cars[:, STEERING]), rtol=1e-5)
+        np.testing.assert_allclose(seen[:, 64] * 30.0, 25.0, rtol=1e-6)
     assert fastest > 1.0
 
 
