@@ -1,4 +1,4 @@
-"""How other projects' learners do on GridSim: python benchmarks/learners.py [--json] [--quick] [--roads]
+"""How other projects' learners do on GridSim: python benchmarks/learners.py [--json] [--quick] [--roads [ROAD ...]]
 
     import_gridsim_ms    `import gridsim` after `import gymnasium`, median of 7 fresh processes
     sb3_vec_env_ratio    car-steps/s under random actions of `SB3VecEnv` with 1,024 cars, over those of
@@ -7,10 +7,10 @@
                          2,000 m that succeed
     ppo_example_success  examples/ppo.py after 3 minutes on `curved`: share of its last 1,024 training episodes
 
-`--roads` measures instead, on the five roads among their usual traffic, in half an hour:
+`--roads` measures instead, among usual traffic on the five roads or those named, in half an hour:
 
-    ppo_sb3_ROAD_60s, _180s    Stable-Baselines3's PPO after so many seconds of learning, with two layers of 64 units that
-                               see what evolution's see: share of 512 held-out drives of 2,000 m that succeed
+    ppo_sb3_ROAD_60s, _180s    Stable-Baselines3's PPO, two layers of 64 units that see what evolution's see, after so
+                               many seconds of learning: share of 512 held-out drives of 2,000 m that succeed
     evolution_ROAD_60s, _180s  the same of `gridsim-evolve`
 
 `--quick` measures the same on a small scale; the figures mean nothing.
@@ -131,10 +131,10 @@ def evolution_on(road: str, cars: int, budgets: tuple[float, ...], drives: int) 
             yield json.loads(subprocess.run(driven, check=True, stdout=subprocess.PIPE).stdout)["success_rate"]
 
 
-def on_roads(budgets: tuple[float, ...], drives: int) -> dict[str, float]:
+def on_roads(roads: list[str], budgets: tuple[float, ...], drives: int) -> dict[str, float]:
     """The figures of `--roads`."""
     figures = {}
-    for road, cars in zip(REGISTRY, crowds("all", "usual"), strict=True):
+    for road, cars in zip(roads, crowds(",".join(roads), "usual"), strict=True):
         for name, learn in (("ppo_sb3", ppo_on), ("evolution", evolution_on)):
             for seconds, share in zip(budgets, learn(road, cars, budgets, drives), strict=True):
                 figures[f"{name}_{road}_{seconds:g}s"] = share
@@ -153,11 +153,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one flat JSON object of numbers, nothing else")
     parser.add_argument("--quick", action="store_true", help="on a small scale; the figures mean nothing")
-    parser.add_argument("--roads", action="store_true", help="PPO and evolution on the five roads, in half an hour")
+    parser.add_argument("--roads", nargs="*", choices=REGISTRY, metavar="ROAD", help="PPO and evolution on roads")
     options = parser.parse_args()
     quick = options.quick
-    if options.roads:
-        show(on_roads((1.0, 2.0) if quick else (60.0, 180.0), 8 if quick else 512), options.json)
+    if options.roads is not None:
+        show(
+            on_roads(options.roads or [*REGISTRY], (1.0, 2.0) if quick else (60.0, 180.0), 8 if quick else 512),
+            options.json,
+        )
         return
     learned = output(EXAMPLE, "--scenario", "curved", "--minutes", "0.05" if quick else "3")
     figures = {

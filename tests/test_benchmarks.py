@@ -22,6 +22,7 @@ RUNS = {
         ["--quick", "--json"],
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
     ),
+    "learners.py --roads": (["curved", "--quick", "--json"], {"ppo_sb3_curved_1s", "evolution_curved_2s"}),
     "peers.py": ([], None),
     "roads.py": (["--minutes", "0.2", "--cars", "4", "--json"], {"block.osm km", "block.osm overlaps"}),
     "scaling.py": (
