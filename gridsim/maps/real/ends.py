@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,11 +13,25 @@ from scipy.spatial import cKDTree
 from gridsim.maps.lanes import Path, sample
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, groups_of, heading, part_of
 
-LOOP_RADIUS, ROUND_RADIUS = 8.0, 20.0  # m, of turning loops and of ways round the world
+ROUND_RADIUS = 20.0  # m, of ways round the world
+
+
+class Loop(NamedTuple):
+    """A kind of turning loop."""
+
+    radius: float  # m
+    width: float  # m, of its lane, at least
+    room: float  # m from its middle line to lanes of other roads, at least
+
+
+# As wide as the ring of a small roundabout, so that who can drive one can turn here; where there is no room, narrow.
+LOOPS = (Loop(10.5, 9.0, 6.5), Loop(8.0, 3.5, 4.2))
 PARTNER = 45.0  # m between the end of a road and the beginning of the opposite direction, at most
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
 SPARE = 15.0  # m that are left of it, at least
-ROOM = 4.2  # m from a loop to lanes of other roads, at least
+ROOM = 4.2  # m from a way round the world to lanes of other roads, at least
+NARROWEST = 3.5  # m, of a way round the world
+LOOP_SPEED = 30 / 3.6  # m/s, in a loop, at most
 WIDEST = 25.0  # m, of a road's end
 LONGEST = 500.0  # m, of a way round the world
 
@@ -67,13 +82,13 @@ class _Ground:
     def _within(self, points: np.ndarray) -> np.ndarray:
         return points if self.sides is None else np.mod(np.mod(points, self.sides), self.sides)
 
-    def is_free(self, line: np.ndarray, but: set[str]) -> bool:
-        """Whether a line [n, 2] keeps its distance from all lanes but some."""
+    def is_free(self, line: np.ndarray, but: set[str], room: float) -> bool:
+        """Whether a line [n, 2] keeps `room` m from all lanes but some."""
         line = self._within(line)
-        near = self.tree.query_ball_point(line, ROOM)
+        near = self.tree.query_ball_point(line, room)
         if not all(self.keys[self.owner[k]] in but for found in near for k in found):
             return False
-        return all(cKDTree(new, boxsize=self.sides).query(line)[0].min() > ROOM for new in self.added)
+        return all(cKDTree(new, boxsize=self.sides).query(line)[0].min() > room for new in self.added)
 
 
 def _dense(line: np.ndarray) -> np.ndarray:
@@ -127,16 +142,18 @@ def add_turning_loops(road: RealRoad) -> None:
 def _add_loop(road: RealRoad, ground: _Ground, one: list[str], other: list[str]) -> bool:
     """Add a loop from a road's end to the beginning of its opposite direction, if there is room."""
     own = {*one, *other}
-    for cut in CUT_BACK:
+    for loop, cut in product(LOOPS, CUT_BACK):
         if cut and min(road.lanes[key].length for key in own) < cut + SPARE:
-            return False
+            continue
         cut_lanes = {key: road.lanes[key] for key in own}
         if cut:
             for key, lane in cut_lanes.items():
                 first, last = (0.0, lane.length - cut) if key in one else (cut, lane.length)
                 cut_lanes[key] = replace(part_of(lane, first, last), successors=lane.successors)
-        new = _connections(cut_lanes, one, other, LOOP_RADIUS, np.zeros(2))
-        if all(ground.is_free(lane.centre[:, :2], own) for lane, _ in new):
+        new = _connections(cut_lanes, one, other, loop.radius, loop.width, np.zeros(2))
+        for lane, _ in new:
+            lane.speed = min(lane.speed, LOOP_SPEED)
+        if all(ground.is_free(lane.centre[:, :2], own, loop.room) for lane, _ in new):
             road.lanes.update(cut_lanes)
             _add(road, new)
             ground.add([lane for lane, _ in new])
@@ -150,7 +167,7 @@ def _beside(one: Lane, other: Lane) -> bool:
 
 
 def _connections(
-    lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, shift: np.ndarray
+    lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, narrowest: float, shift: np.ndarray
 ) -> list[tuple[Lane, str]]:
     """Lanes from the ends of some to the beginnings of others, moved by `shift`; each with where it begins."""
 
@@ -170,8 +187,8 @@ def _connections(
         line = np.column_stack([points, np.zeros(len(points))])
         line[0, :2], line[-1, :2] = lanes[source].centre[-1, :2], lanes[target].centre[0, :2] + shift
         width = float(np.hypot(*(lanes[source].left - lanes[source].right)[-1, :2]))
-        speed = min(lanes[source].speed, 30 / 3.6) if radius == LOOP_RADIUS else lanes[source].speed
-        lane = Lane(*bounds_of(line, max(width, 3.5)), speed, [target], junction=f"end {source}")
+        bounds = bounds_of(line, max(width, narrowest))
+        lane = Lane(*bounds, lanes[source].speed, [target], junction=f"end {source}")
         found.append((lane, source))
     return found
 
@@ -200,9 +217,9 @@ def join_round_the_world(road: RealRoad, sides: np.ndarray) -> None:
     for _, length, i, j, moved in sorted(found, key=lambda way: way[:4]):
         if i in used_out or j in used_back:
             continue
-        new = _connections(road.lanes, out[i], back[j], ROUND_RADIUS, moved)
+        new = _connections(road.lanes, out[i], back[j], ROUND_RADIUS, NARROWEST, moved)
         own = {*back[j], *(key for group in out for key in group if _beside(road.lanes[key], road.lanes[out[i][0]]))}
-        if all(ground.is_free(lane.centre[:, :2], own) for lane, _ in new):
+        if all(ground.is_free(lane.centre[:, :2], own, ROOM) for lane, _ in new):
             _add(road, new)
             ground.add([lane for lane, _ in new])
             used_out.add(i)
