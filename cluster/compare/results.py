@@ -67,7 +67,8 @@ def read_run(folder: Path) -> Run:
     settings, _ = read_config(folder / CONFIG)
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        figures = {name: float((summary | summary["held_out"])[name]) for name in RUN_FIGURES}
+        held_out = {"km_per_collision": math.nan} | summary["held_out"]  # which earlier versions did not write
+        figures = {name: float((summary | held_out)[name]) for name in RUN_FIGURES}
         return Run(folder, settings, str(summary["champion_sha256"]), figures)
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         raise GridSimError(f"{path} is damaged; delete it, and make it again with {again}") from error

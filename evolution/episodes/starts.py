@@ -10,8 +10,8 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
-from gridsim.state import LANE, POSE, TRAFFIC_FIELDS
-from gridsim.traffic.world import spawn
+from gridsim.state import POSE
+from gridsim.traffic.world import empty_worlds, spawn
 
 
 class Episodes(NamedTuple):
@@ -42,20 +42,18 @@ def lane_starts(
 
     They have the configuration's target and time limit.
     Args: `traffic`, one number for all maps or one for each; `room`, the least number of cars in the arrays, of which
-    those beyond `traffic` are absent (LANE is -1).
+    those beyond `traffic` are absent.
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), cars, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()
     episodes = np.zeros(len(maps), dtype=EPISODE)
     cars = np.broadcast_to(traffic, len(road_maps)).tolist()
-    room = max([room, *cars])
-    worlds = np.zeros((len(maps), room, TRAFFIC_FIELDS), dtype=np.float32)
-    worlds[:, :, LANE] = -1.0
+    worlds = empty_worlds(len(maps), max([room, *cars]))
     episodes["map"], episodes["target"], episodes["steps"] = maps, config.episode.target, config.episode.steps
     on_each = [(m, np.flatnonzero(maps == m)) for m in np.unique(maps)]
     for m, of in on_each:
         episodes["start"][of, :POSE] = sample_starts(road_maps[m], len(of), rng)
-    if room:
+    if worlds.shape[1]:
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
         for m, of in on_each:
             worlds[of, : cars[m]] = spawn(road_maps[m].network, episodes["start"][of], cars[m], keys[of], config)

@@ -16,8 +16,7 @@ from gridsim.maps.map import Map, starts_at
 from gridsim.maps.parts import is_map_file, road_number, seed_of_map
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
-from gridsim.state import LANE, TRAFFIC_FIELDS
-from gridsim.traffic.world import spawn
+from gridsim.traffic.world import empty_worlds, spawn
 
 #: The maps of this process's environments, kept while one of them uses them.
 _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
@@ -84,8 +83,7 @@ class Episodes:
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)
-        worlds = np.zeros((len(which), max(self.crowds), TRAFFIC_FIELDS), dtype=np.float32)
-        worlds[:, :, LANE] = -1.0
+        worlds = empty_worlds(len(which), max(self.crowds))
         on_each: defaultdict[int, list[int]] = defaultdict(list)
         for k, seed in enumerate(seeds):
             on_each[seed].append(k)

@@ -123,14 +123,20 @@ def check_traffic(cars: int, config: SimConfig) -> None:
         raise GridSimError(f"traffic is for cars of 2.9 m or more, not of {config.vehicle.length:g} m: use traffic 0")
 
 
+def empty_worlds(episodes: int, cars: int) -> np.ndarray:
+    """Worlds float32 [episodes, cars, TRAFFIC_FIELDS] in which all cars are absent (LANE is -1)."""
+    worlds = np.zeros((episodes, cars, s.TRAFFIC_FIELDS), dtype=np.float32)
+    worlds[:, :, s.LANE] = -1.0
+    return worlds
+
+
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
     """Worlds float32 [n, cars, TRAFFIC_FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
-    Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
+    Cars are uniform over the lanes outside junctions. A car for which there is no room is absent.
     """
     check_traffic(cars, config)
-    worlds, traffic = np.zeros((len(starts), cars, s.TRAFFIC_FIELDS), dtype=np.float32), config.traffic
-    worlds[:, :, s.LANE] = -1.0
+    worlds, traffic = empty_worlds(len(starts), cars), config.traffic
     if cars and len(network.offsets) > 1:
         half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)

@@ -154,6 +154,15 @@ def test_runs_are_compared_from_python(tmp_path):
         gridsim.compare(tmp_path / "c")
 
 
+def test_a_run_of_a_version_that_did_not_measure_kilometres_per_collision_is_compared(tmp_path):
+    summary = make_run(tmp_path / "a")
+    del summary["held_out"]["km_per_collision"]
+    (tmp_path / "a" / "summary.json").write_text(json.dumps(summary))
+    figures = read_run(tmp_path / "a").figures
+    assert math.isnan(figures["km_per_collision"])
+    assert figures["success_rate"] == 0.5
+
+
 @pytest.mark.parametrize(
     ("file", "content", "said"),
     [

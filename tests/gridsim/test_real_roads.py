@@ -184,6 +184,7 @@ def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
     name = written(tmp_path, "crossing.osm", osm(CROSSING))
     here = build(name, 0)
     assert "4 roads that end got a turning loop" in load.described(name, SIM).notes
+    assert clearances(here.road, here.network.points).max() > 4.3, "loops are wider than the roads of 3.5 m a lane"
     world = spawn(here.network, np.full((1, 5), 1e6, np.float32), 12, np.zeros(1, np.uint64), SIM)[0]
     assert (world[:, LANE] >= 0).sum() >= 10
     overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 6000)

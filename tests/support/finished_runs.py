@@ -30,7 +30,7 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, settings=No
     summary = {
         "scenario": settings.scenario, "seed": settings.seed, "car_steps": 5000, "wall_s": 12.5,
         "champion_generation": 1, "training_s": 6.0, "best_car_steps": 3000.0, "best_wall_s": 4.0,
-        "champion_sha256": champion.sha256, "held_out": HELD_OUT,
+        "champion_sha256": champion.sha256, "held_out": dict(HELD_OUT),
     }  # fmt: skip
     RunFolder(folder, settings).write_config()
     (folder / "summary.json").write_text(json.dumps(summary))
