@@ -99,12 +99,14 @@ def may_enter(network, drivers, world, i, ego, ego_way, seconds):
         onward = I(world[j, s.NEXT])
         if network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds):
             return False
+        behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # where the next lane comes back to this one
         # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
             if permit == other:
                 return False
-            if there == other and world[j, s.ALONG] - drivers.half_length < network.clear[c] + config.JUNCTION_MARGIN:
+            rear = world[j, s.ALONG] - drivers.half_length
+            if there == other and not behind and rear < network.clear[c] + config.JUNCTION_MARGIN:
                 return False
             if past == other and lane_length(network, other) + world[j, s.ALONG] - drivers.half_length < (
                 network.clear[c] + config.JUNCTION_MARGIN

@@ -7,14 +7,24 @@ import pickle
 
 import numpy as np
 import pytest
-from written_roads import BRITAIN, both_ways, commonroad, lanelet2, opendrive, opendrive_crossing, osm, street
+from written_roads import (
+    BRITAIN,
+    both_ways,
+    commonroad,
+    figure_of_eight,
+    lanelet2,
+    opendrive,
+    opendrive_crossing,
+    osm,
+    street,
+)
 
 from gridsim.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
-from gridsim.maps.network import is_junction
-from gridsim.maps.real import content, load, sumo
+from gridsim.maps.network import is_junction, make_network
+from gridsim.maps.real import content, load, shape, sumo
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
@@ -190,6 +200,45 @@ def test_traffic_drives_on_a_crossing_with_turning_loops(tmp_path):
     overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 6000)
     assert (overlaps, off) == (0, 0)
     assert stood < 600
+
+
+@pytest.mark.parametrize(("radius", "cars"), [(10.0, 4), (15.0, 6), (80.0, 20)])
+def test_road_that_comes_back_over_itself(tmp_path, radius, cars):
+    """A lane crosses the one that it follows: there, too, one car goes after another."""
+    here = build(written(tmp_path, "eight.xml", commonroad(figure_of_eight(radius), EIGHT)), 0)
+    world = spawn(here.network, np.full((1, 5), 1e6, np.float32), cars, np.ones(1, np.uint64), SIM)[0]
+    assert (world[:, LANE] >= 0).sum() == cars
+    overlaps, off, stood = drive(here.road, here.network, drivers(SIM), constants(SIM), world, NOBODY, 6000)
+    assert (overlaps, off) == (0, 0)
+    assert stood < 600
+    assert (world[:, LANE] >= 0).all()  # none stood so long that it was taken away
+
+
+EIGHT = {1: [2], 2: [3], 3: [1]}
+
+
+def test_who_follows_does_not_block_the_way_back_over_its_lane(tmp_path):
+    """Two cars on a lane: the first may enter the lane that comes back over it, although the other is on it."""
+    name = written(tmp_path, "eight.xml", commonroad(figure_of_eight(30.0), EIGHT))
+    lanes = load.read_road(load.Path(name)).lanes
+    network = as_they_are(lanes, load.sides_of(lanes), build(name, 0).road)
+    assert network.crossings.tolist() == [1, 0]
+    world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
+    for car, along in zip(world, (57.0, 40.0), strict=True):
+        car[[LANE, NEXT, SECOND_NEXT, ALONG, JUNCTION_BEHIND, PERMIT, SPEED_FACTOR]] = 0, 1, 2, along, -1, -1, 1
+        set_pose(network, car)
+    for _ in range(50):
+        step_traffic(network, drivers(SIM), world, NOBODY)
+    assert world[0, LANE] == 1.0
+
+
+def as_they_are(lanes, size, road, crossing=()):
+    """The network of lanes that are not shaped; some more of them cross."""
+    conflicts = shape.Conflicts(lanes, load.gap_of(SIM), size)
+    for one, other in crossing:
+        conflicts.cross[one, other] = conflicts.cross[other, one] = True
+    network = shape.network_of(lanes, conflicts, 1.0)
+    return make_network(network, road, SIM, np.full(len(lanes), 12.0, np.float32))
 
 
 MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROSSING[1]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 GERMANY, BRITAIN = (50.0, 9.0), (52.0, -3.0)
 HALF = 1.6  # m, half the width of a lane
@@ -115,8 +115,28 @@ def both_ways(length: float, hand: float = 1.0) -> list[Bounds]:
     return [there, back] if hand > 0 else [there[::-1], back[::-1]]
 
 
+def figure_of_eight(radius: float) -> list[Bounds]:
+    """Three lanes, one behind the other in a circle: a straight one, a loop back across it, and a loop to its start."""
+    r, n = radius, 40
+    turns = [(i + 0.5) / n * 1.5 * math.pi for i in range(n)]
+    straight = [(-r, 0.0), (0.0, 0.0), (r, 0.0)]
+    loop = [(r + r * math.sin(a), r - r * math.cos(a)) for a in turns]
+    back = [(-r + r * math.cos(a), -r - r * math.sin(a)) for a in turns]
+    lines = [straight, [straight[-1], *loop, (0.0, r), (0.0, 0.0), (0.0, -r)], [(0.0, -r), *back, straight[0]]]
+    lanes: list[Bounds] = []
+    for line in lines:
+        left, right = [], []
+        for k, (x, y) in enumerate(line):
+            (a, b), (c, d) = line[max(k - 1, 0)], line[min(k + 1, len(line) - 1)]
+            w = HALF / math.hypot(c - a, d - b)
+            left.append((x - w * (d - b), y + w * (c - a)))
+            right.append((x + w * (d - b), y - w * (c - a)))
+        lanes.append((left, right))
+    return lanes
+
+
 def commonroad(
-    lanes: Sequence[Bounds], successors: dict[int, Sequence[int]] | None = None, lights: dict[int, int] | None = None
+    lanes: Sequence[Bounds], successors: Mapping[int, Sequence[int]] | None = None, lights: dict[int, int] | None = None
 ) -> str:
     """Lanelets, numbered from 1, with their successors; `lights` are red for so many steps of 0.1 s at first."""
 

@@ -67,43 +67,84 @@ def _find_conflicts(points, offsets, candidates, width, height, gap):
     return cross
 
 
+def _line(lane: Lane) -> np.ndarray:
+    return resampled(lane, max(math.ceil(lane.length / LANE_STEP), 1))[0]
+
+
+def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.ndarray:
+    """A lane's line without what is close to its first point, and to its last one, where it joins a certain other."""
+    for end, joins in ((0, first), (-1, last)):
+        if joins and len(line):
+            far = np.flatnonzero(np.hypot(*(line - line[end]).T) >= 2.0 * gap)
+            line = line[:0] if not len(far) else line[: far[-1] + 1] if end else line[far[0] :]
+    return line
+
+
 class Conflicts:
-    """Which lanes may collide: they come closer than `gap` m, and are not one behind the other or side by side."""
+    """Which lanes may collide: they come closer than `gap` m, and are not side by side.
+
+    Of two that follow each other, what is close to where they do so does not count.
+    """
 
     def __init__(self, lanes: dict[str, Lane], gap: float, size: np.ndarray):
         self.keys = list(lanes)
-        self.lines = [resampled(lane, max(math.ceil(lane.length / LANE_STEP), 1))[0] for lane in lanes.values()]
+        self.lines = [_line(lane) for lane in lanes.values()]
         self.index = {key: k for k, key in enumerate(self.keys)}
         points = np.concatenate(self.lines).astype(np.float32)
         offsets = np.concatenate([[0], np.cumsum([len(line) for line in self.lines])]).astype(np.int32)
         middle, half = boxes_of(points, offsets)
         apart = abs(_short(middle[:, None] - middle[None], size)) - half[:, None] - half[None]
         candidates = (apart < gap + ASKEW).all(axis=2)
-        for row in self._related(lanes):
-            candidates[np.ix_(row, row)] = False
-        self.cross = _find_conflicts(points, offsets, candidates, *size, gap)
         self.gap, self.size = gap, size
-
-    def _related(self, lanes: dict[str, Lane]) -> Iterable[list[int]]:
-        """Sets of lanes that do not conflict with each other."""
+        self.follows = np.zeros_like(candidates)
+        for key, other in self._following(lanes):
+            self.follows[self.index[key], self.index[other]] = True
+        related = self.follows | self.follows.T
         for group in groups_of(lanes):
-            yield [self.index[key] for key in group]
+            row = [self.index[key] for key in group]
+            related[np.ix_(row, row)] = True
+        self.cross = _find_conflicts(points, offsets, candidates & ~related, *size, gap)
+        self._add_loops()
+
+    def _following(self, lanes: dict[str, Lane]) -> Iterable[tuple[str, str]]:
+        """Lanes and what follows them, also after a short one."""
         for key, lane in lanes.items():
-            here = self.index[key]
-            for other in (self.index[s] for s in lane.successors):
-                yield [here, other]
-                onward = lanes[self.keys[other]]
-                if onward.length < LEAST + 3.0:
-                    for last in onward.successors:
-                        yield [here, self.index[last]]
+            for other in lane.successors:
+                yield key, other
+                if lanes[other].length < LEAST + 3.0:
+                    for last in lanes[other].successors:
+                        yield key, last
+
+    def _add_loops(self) -> None:
+        """Add the conflicts of lanes with those that follow them and come back over or beside them."""
+        for one, other in np.argwhere(self.follows).tolist():
+            lines = self._seen_from(other, one), self._seen_from(one, other)
+            if one != other and _near(*lines, *self.size, self.gap):
+                self.cross[one, other] = self.cross[other, one] = True
+
+    def _seen_from(self, here: int, other: int) -> np.ndarray:
+        """Another lane's line, without what is close to where it follows one or leads to it."""
+        return _beyond_joints(self.lines[other], self.follows[here, other], self.follows[other, here], self.gap)
+
+    def is_loop(self, lanes: dict[str, Lane], key: str, other: str) -> bool:
+        """Whether a lane that follows another comes back to it: one lane of both would cross itself."""
+        ring = key in lanes[other].successors
+        one = _beyond_joints(_line(lanes[key]), ring, True, self.gap)
+        return bool(_near(one, _beyond_joints(_line(lanes[other]), True, ring, self.gap), *self.size, self.gap))
+
+    def in_loop(self, key: str) -> bool:
+        """Whether a lane conflicts with one that it follows or leads to."""
+        here = self.index[key]
+        return bool((self.cross[here] & (self.follows[here] | self.follows[:, here])).any())
 
     def __contains__(self, key: str) -> bool:
         return bool(self.cross[self.index[key]].any())
 
     def zone(self, key: str) -> tuple[float, float]:
         """From where to where (m) on a lane others come too close to it."""
-        line = self.lines[self.index[key]]
-        others = np.concatenate([self.lines[k] for k in np.flatnonzero(self.cross[self.index[key]])])
+        here = self.index[key]
+        line = self.lines[here]
+        others = np.concatenate([self._seen_from(here, k) for k in np.flatnonzero(self.cross[here]).tolist()])
         away = _short(line[:, None] - others[None], self.size)
         near = np.flatnonzero((np.hypot(away[..., 0], away[..., 1]) < self.gap + ASKEW).any(axis=1))
         step = np.hypot(*np.diff(line, axis=0).T).mean()
@@ -141,25 +182,29 @@ def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[st
     return found if fits else None
 
 
-def _merge(lanes: dict[str, Lane], crossed: set[str]) -> None:
+def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
     """Join lanes to whole stretches of road; lanes that others cross only if they are short."""
+    crossed = {key for key in lanes if key in conflicts}
     before = predecessors(lanes)
     for group in groups_of(lanes):
         while all(key in lanes for key in group):
             onward = _forward(lanes, group, before)
             if onward is None or any(lanes[key].light for key in onward):
                 break
+            pairs = list(zip(group, onward, strict=True))
+            if any(conflicts.is_loop(lanes, *pair) for pair in pairs):
+                break
             together = sum(max(lanes[key].length for key in keys) for keys in (group, onward))
             short = min(lanes[key].length for key in (*group, *onward)) < LEAST
             if not short and (together > WHOLE or crossed & {*group, *onward}):
                 break
-            for key, other in zip(group, onward, strict=True):
+            for key, other in pairs:
                 lanes[key] = joined(lanes[key], lanes.pop(other))
                 for last in lanes[key].successors:
                     before[last] = [key if k == other else k for k in before[last]]
 
 
-def _absorb(lanes: dict[str, Lane]) -> None:
+def _absorb(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
     """Make short lanes part of all that lead to them, or of all that follow them."""
     before = predecessors(lanes)
     for key in sorted(lanes, key=lambda name: lanes[name].length):
@@ -170,6 +215,9 @@ def _absorb(lanes: dict[str, Lane]) -> None:
         if lane.length <= APPROACH and all(lanes[p].successors == [key] and _is_alone(lanes[p]) for p in first):
             limit = APPROACH
         if lane.length > limit:
+            continue
+        pairs = [(p, key) for p in first] + [(key, s) for s in lane.successors]
+        if any(conflicts.is_loop(lanes, *pair) for pair in pairs):
             continue
         if all(lanes[p].successors == [key] for p in first):
             for p in first:
@@ -209,6 +257,8 @@ def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
         if set(onward) != set(lane.successors) or not _is_alone(lane):
             continue
         if lane.length + max(lanes[s].length for s in onward) > ACROSS:
+            continue
+        if any(conflicts.is_loop(lanes, key, s) for s in onward):
             continue
         names = {s: f"{key}>{s}" for s in onward}
         for s, name in names.items():
@@ -267,7 +317,10 @@ def _give_head(lanes: dict[str, Lane], before: dict[str, list[str]], group: list
 
 def _split(lanes: dict[str, Lane], group: list[str], share: float) -> list[str]:
     """Split the lanes of a group at a share of their length; returns the second part."""
-    names = {key: f"{key}+" for key in group}
+    mark = "+"
+    while any(key + mark in lanes for key in group):  # one may be split twice
+        mark += "+"
+    names = {key: key + mark for key in group}
     for key in group:
         lane = lanes[key]
         at = share * lane.length
@@ -302,13 +355,15 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
             continue
         zones = [conflicts.zone(key) for key in crossed]
         first, last = min(zone[0] for zone in zones) - 1.0, max(zone[1] for zone in zones) + 1.0
+        apart = any(conflicts.in_loop(key) for key in crossed)  # the lane at its end must not cross itself
         if (
-            last > length - NEAR_END
+            not apart
+            and last > length - NEAR_END
             and first > length - 2 * NEAR_END
             and _give_tail(lanes, before, group, length - first)
         ):
             continue
-        if first < NEAR_END and last < 2 * NEAR_END and _give_head(lanes, before, group, last):
+        if not apart and first < NEAR_END and last < 2 * NEAR_END and _give_head(lanes, before, group, last):
             continue
         if last < length - LEAST and last > LEAST:
             _split(lanes, group, last / length)
@@ -336,9 +391,9 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
     for key, lane in lanes.items():
         lane.light = lane.light if key in conflicts else ""  # where nobody crosses, nobody waits
     for _ in range(3):
-        _absorb(lanes)
+        _absorb(lanes, conflicts)
         conflicts = Conflicts(lanes, gap, size)
-        _merge(lanes, {key for key in lanes if key in conflicts})
+        _merge(lanes, conflicts)
         conflicts = Conflicts(lanes, gap, size)
         _contract(lanes, conflicts)
         _lengthen(lanes)
