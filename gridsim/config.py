@@ -44,6 +44,7 @@ SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sid
 STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
 LANE_CHANGE_ALONE = _F(20.0)  # m within which only one car at a time changes to or from a lane
 KEEP_LANE = _F(30.0)  # m before a junction, or where lanes part, within which cars stay in their lane
+SKEW = _F(0.05)  # m up to which a point of a lane is beside the one with the same index on its neighbour
 WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
 JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a crossing before the other lane is free
 

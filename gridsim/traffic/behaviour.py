@@ -275,6 +275,20 @@ def _lanes_apart(network, lane, along, target):
     return math.sqrt(dx * dx + dy * dy)
 
 
+@leaf
+def _skew(network, lane, along, target):
+    """How far (m) a neighbour's point is ahead of being beside a lane's with the same index; 0 up to SKEW."""
+    k = I(along / network.steps[lane])
+    one, other = network.offsets[lane] + k, network.offsets[target] + k
+    first = min(other, network.offsets[target + 1] - 2)
+    dx = wrapped_any(network.points[other, 0] - network.points[one, 0], network.width)
+    dy = wrapped_any(network.points[other, 1] - network.points[one, 1], network.height)
+    tx = network.points[first + 1, 0] - network.points[first, 0]
+    ty = network.points[first + 1, 1] - network.points[first, 1]
+    skew = (dx * tx + dy * ty) / network.steps[target]
+    return skew if abs(skew) > config.SKEW else ZERO
+
+
 @njit(_nrt=False)
 def _choose_neighbour(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007, equations 1 and 2). Not inlined: calls are expensive but rare."""
@@ -285,9 +299,10 @@ def _choose_neighbour(network, drivers, world, i, ego):
     best, gain = I(-1), drivers.threshold
     for side in range(2):
         target = network.left[lane] if (side == 0) == (network.hand > ZERO) else network.right[lane]
-        if target < 0:
-            continue
-        along = car[s.ALONG] / network.steps[lane] * network.steps[target]
+        if target < 0 or is_junction(network, target):
+            continue  # it would enter a junction lane without a permit
+        skew = _skew(network, lane, car[s.ALONG], target)
+        along = max(car[s.ALONG] / network.steps[lane] * network.steps[target] - skew, ZERO)
         apart = _lanes_apart(network, lane, car[s.ALONG], target)
         # The gaps to the next cars ahead and behind in the target lane, and to the one behind in its own.
         front, front_speed, rear, rear_speed, rear_desired = F(1e9), ZERO, F(1e9), ZERO, ONE
@@ -347,8 +362,11 @@ def _choose_neighbour(network, drivers, world, i, ego):
         along, onward, beyond = car[s.ALONG], car[s.NEXT], car[s.SECOND_NEXT]
         nearest, lead_speed = car[s.GAP], car[s.LEAD_SPEED]
         apart = _lanes_apart(network, lane, along, best)
+        skew = _skew(network, lane, along, best)
+        if skew != ZERO:
+            apart = math.sqrt(max(apart * apart - skew * skew, ZERO))
         car[s.SHIFT] = -apart if best == network.left[lane] else apart
-        car[s.ALONG] = along / network.steps[lane] * network.steps[best]
+        car[s.ALONG] = max(along / network.steps[lane] * network.steps[best] - skew, ZERO)
         car[s.LANE], car[s.PERMIT] = F(best), -ONE
         car[s.NEXT] = F(choose_lane(network, best, car))
         car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))

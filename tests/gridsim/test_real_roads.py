@@ -25,6 +25,7 @@ from gridsim.errors import GridSimError
 from gridsim.jit import njit
 from gridsim.maps.network import is_junction, make_network
 from gridsim.maps.real import content, load, shape, sumo
+from gridsim.maps.real.description import Lane, bounds_of
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
@@ -239,6 +240,36 @@ def as_they_are(lanes, size, road, crossing=()):
         conflicts.cross[one, other] = conflicts.cross[other, one] = True
     network = shape.network_of(lanes, conflicts, 1.0)
     return make_network(network, road, SIM, np.full(len(lanes), 12.0, np.float32))
+
+
+@pytest.mark.parametrize("crossing", [False, True])
+def test_lane_changes(tmp_path, crossing):
+    """A car stays where it is beside a lane of another length, and out of a lane in which it would need a permit."""
+    x = np.arange(0.0, 257.0)
+    sides = np.array([256.0, 128.0])
+    bow = np.where((x > 10) & (x < 30), 5.0 * np.sin(np.pi * (x - 10) / 20) ** 2, 0.0)
+    lines = {"a": 0.0 * x, "b": 3.5 + bow, "c": 60.0 + 0.0 * x}
+    lanes = {}
+    for key, y in lines.items():
+        bounds = bounds_of(np.column_stack([x, y, 0.0 * x]), 3.2)
+        lanes[key] = Lane(*bounds, 12.0, [key])
+    lanes["a"].left_lane, lanes["b"].right_lane = "b", "a"
+    road = build(written(tmp_path, "a.xml", commonroad(both_ways(200.0))), 0).road
+    network = as_they_are(lanes, sides, road, [(1, 2)] if crossing else [])
+    lengths = (np.diff(network.offsets) - 1) * network.steps
+    assert lengths[1] > lengths[0] + 2.0
+    world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
+    for car, along, factor in zip(world, (100.0, 130.0), (1.0, 0.2), strict=True):
+        car[[ALONG, JUNCTION_BEHIND, PERMIT, SPEED_FACTOR, SPEED]] = along, -1, -1, factor, 12.0 * factor
+        set_pose(network, car)
+    changed = False
+    for _ in range(60):
+        before = world[0].copy()
+        step_traffic(network, drivers(SIM), world, NOBODY)
+        moved = np.hypot(*(world[0] - before)[[X, Y]])
+        assert moved < before[SPEED] * 0.1 + 0.2
+        changed |= bool(world[0, LANE] != 0)
+    assert changed != crossing
 
 
 MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROSSING[1]]
