@@ -80,6 +80,17 @@ def _must_yield(network, drivers, car, other, first, last, seconds):
 
 
 @leaf
+def _has_no_room(drivers, world, car):
+    """Whether a car waits before a junction because another one stands where it would leave the junction."""
+    place = F(3.0) * drivers.half_length + drivers.jam
+    for k in range(world.shape[0] if car[s.SPEED] < config.WALKING_PACE else 0):
+        stands = world[k, s.SPEED] < config.WALKING_PACE
+        if stands and world[k, s.LANE] == car[s.SECOND_NEXT] and world[k, s.ALONG] < place:
+            return True
+    return False
+
+
+@leaf
 def may_enter(network, drivers, world, i, ego, ego_way, seconds):
     """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond.
 
@@ -97,7 +108,8 @@ def may_enter(network, drivers, world, i, ego, ego_way, seconds):
             continue
         there, past, permit = I(world[j, s.LANE]), I(world[j, s.JUNCTION_BEHIND]), I(world[j, s.PERMIT])
         onward = I(world[j, s.NEXT])
-        if network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds):
+        goes_first = network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds)
+        if goes_first and not _has_no_room(drivers, world, world[j]):
             return False
         behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # where the next lane comes back to this one
         # Most cars are not near a junction and need no check.

@@ -276,7 +276,10 @@ MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROS
 
 
 def test_main_road_goes_first(tmp_path):
-    """Traffic of the other road waits for a car that comes 2 s after it, and for one that stands at the line."""
+    """Traffic of the other road waits for a car that comes 2 s after it, and for one that stands at the line.
+
+    It does not wait for one that has no room to drive on.
+    """
     here = build(written(tmp_path, "main.osm", osm(MAIN)), 0)
     network = here.network
     assert len(network.yields) == len(network.crossings)
@@ -292,22 +295,27 @@ def test_main_road_goes_first(tmp_path):
         across = max(onward, key=lambda k: directions[network.offsets[k + 1] - 2] @ ahead)
         return across, network.successors[across, 0]
 
-    for speed, away in ((8.0, 44.0), (0.0, 2.2)):
+    for speed, away, full in ((8.0, 44.0, False), (0.0, 2.2, False), (0.0, 2.2, True)):
         first = []
         for lanes in (network, network._replace(yields=network.yields[:0])):
-            world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
-            for car, lane, v, metres in zip(world, (minor, main), (6.0, speed), (20.0, away), strict=True):
+            world = np.zeros((3, TRAFFIC_FIELDS), dtype=np.float32)
+            for car, lane, v, metres in zip(world, (minor, main), (6.0, speed), (20.0, away), strict=False):
                 car[[LANE, ALONG, SPEED]] = lane, lengths[lane] - metres, v
                 car[[NEXT, SECOND_NEXT]] = straight(lane)
                 car[[JUNCTION_BEHIND, PERMIT, SPEED_FACTOR]] = -1.0, -1.0, 1.0
                 set_pose(lanes, car)
-            entered = np.zeros(2)
+            exit_lane = int(world[1, SECOND_NEXT])
+            stands = [exit_lane if full else -1, 4.0, *straight(exit_lane), -1, -1, 1.0]
+            world[2, [LANE, ALONG, NEXT, SECOND_NEXT, JUNCTION_BEHIND, PERMIT, SPEED_FACTOR]] = stands
+            set_pose(lanes, world[2] if full else world[0])
+            standing, entered = world[2].copy(), np.zeros(2)
             for k in range(200):
+                world[2] = standing if k < 100 else world[2]
                 step_traffic(lanes, drivers(SIM), world, NOBODY)
-                entered[(entered == 0) & (world[:, LANE] != [minor, main])] = k
+                entered[(entered == 0) & (world[:2, LANE] != [minor, main])] = k
             assert (entered > 0).all()
             first.append(np.argmin(entered))
-        assert first == [1, 0]
+        assert first == [0 if full else 1, 0]
 
 
 def test_driving_back_on_the_other_lane_is_new_distance(tmp_path):
