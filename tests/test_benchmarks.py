@@ -14,10 +14,10 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 RUNS = {
     "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
     "faults.py": (
-        ["--faults", "4", "--json"],
+        ["--faults", "2", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
-    "faults.py --cluster": (["--faults", "2", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
+    "faults.py --cluster": (["--faults", "1", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
     "learners.py": (
         ["--quick", "--json"],
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},

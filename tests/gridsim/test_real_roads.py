@@ -272,6 +272,13 @@ def test_lane_changes(tmp_path, crossing):
     assert changed != crossing
 
 
+def test_a_lane_hardly_wider_than_a_car_has_room_for_its_ends(tmp_path):
+    """Which swing out in bends, and where it changes lanes. A lane of 2.1 m, as one in Karlsruhe."""
+    narrow = [([(x, 0.3 * y) for x, y in left], [(x, 0.3 * y) for x, y in right]) for left, right in both_ways(200.0)]
+    here = build(written(tmp_path, "narrow.xml", commonroad(narrow)), 0)
+    assert clearances(here.road, here.network.points).min() > 1.2
+
+
 MAIN = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0), highway="primary"), CROSSING[1]]
 
 

@@ -18,19 +18,23 @@ SLIT = 2  # pixels around the road in which walls that are as thin on both sides
 ISLAND = 30.0  # m2; smaller walls inside of junctions are taken for gaps, too
 _REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, of the longest distance in the field
 
+AIR = 0.3  # m on each side of a narrow lane's cars, whose ends swing out in bends and as they change lanes
 SHARP = 0.1  # rad
 SWEPT = 2.5  # m around a sharp bend that a car's corners may pass
 _CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
 _OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1
 
 
-def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.ndarray) -> np.ndarray:
-    """Clearance float32 [rows, columns] (m) at the nodes of a torus of this size (m)."""
+def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.ndarray, gap: float) -> np.ndarray:
+    """Clearance float32 [rows, columns] (m) at the nodes of a torus of this size (m).
+
+    Every lane has room for its cars: narrower ones become `gap` m, in which cars pass each other, and twice AIR wide.
+    """
     columns, rows = (round(float(side) / PIXEL) for side in size)
     picture = Image.new("L", (columns, rows))
     draw = ImageDraw.Draw(picture)
     for lane in lanes.values():
-        left, right = lane.left[:, :2], lane.right[:, :2]
+        left, right = _widened(lane.left[:, :2], lane.right[:, :2], gap + 2.0 * AIR)
         for quad in np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1):
             _fill(draw, quad, size)
         middle = (left + right) / 2
@@ -58,6 +62,13 @@ def _window(used: np.ndarray) -> np.ndarray:
         first, last = 0, len(used) - 1
     first = (first - 2 * _REACH) // FINE * FINE
     return np.arange(first, first + math.ceil((last + 2 * _REACH - first) / FINE) * FINE)
+
+
+def _widened(left: np.ndarray, right: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [n, 2] of a lane, farther apart where it is narrower than `least` m."""
+    middle, half = (left + right) / 2, (left - right) / 2
+    half *= np.maximum(least / np.maximum(2.0 * np.hypot(*half.T), 1e-9), 1.0)[:, None]
+    return middle + half, middle - half
 
 
 def _corners(line: np.ndarray) -> np.ndarray:

@@ -145,7 +145,7 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     outlines = [outline - origin for outline in inside]
     hand = road.hand or hand_of(road.lanes)
     lanes, conflicts = shaped(road.lanes, gap, size)
-    nodes = clearance_of(lanes, outlines, size)
+    nodes = clearance_of(lanes, outlines, size, gap)
     road_there = make_road(nodes, (0.0, 1.0), 2.0 * HALF_WALL)
     network = with_lights(network_of(lanes, conflicts, hand), lanes, road_there)
     limits = np.array([lane.speed for lane in lanes.values()])
