@@ -249,13 +249,18 @@ def draw_compute(rows: Mapping[str, Sequence[str]], store: Store, path: Path) ->
         medians = []
         for commands in (commands for label, commands in rows.items() if f"--scenario {road} " in label):
             runs = [measured for command in commands if (measured := store.kept(command))]
+            if not runs:
+                continue
             million = [run["car_steps"] / 1e6 for run in runs]
             failures = [EPISODES * (1.0 - run["held_out"]["success_rate"]) for run in runs]
             axes.plot(million, failures, ".", color=f"C{k}")
             medians.append((statistics.median(million), statistics.median(failures)))
         axes.plot(*zip(*medians, strict=True), color=f"C{k}", label=road)
     axes.set(xscale="log", yscale="log", xlabel="million car-steps", ylabel=f"failures of {EPISODES:,} held-out drives")
-    axes.grid(alpha=0.25, which="both")
+    axes.set_xticks([15, 60, 240, 960], ["15", "60", "240", "960"])
+    axes.minorticks_off()
+    axes.set_yticks([5, 10, 20, 50, 100, 200, 500], ["5", "10", "20", "50", "100", "200", "500"])
+    axes.grid(alpha=0.25)
     axes.legend()
     figure.savefig(path, dpi=110)
 
