@@ -36,7 +36,6 @@ from gridsim.traffic.world import check_traffic
 MAX_TRAFFIC = 100
 MAX_STEPS = 10**15  # car-steps or episodes
 SETTLED = 40  # generation from which steps shrink in traffic, by measurement
-LIMIT = "+limit"  # what a network sees besides where there are several roads, so that it tells a highway from a city
 LEAST_GROUP = 16  # members of a group, so that its best are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
@@ -116,6 +115,11 @@ class RunSettings(ABC):
     def crowds(self) -> tuple[int, ...]:
         """Other cars on each of its roads."""
         return crowds(self.scenario, self.traffic, self.simulator())
+
+    @property
+    def _sees_besides(self) -> str:
+        """End of the default policy: on several roads the speed limit tells a highway from a city."""
+        return "+limit" if len(self.crowds) > 1 else ""
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: it suits its roads, the car's size, and traffic if there is any."""
@@ -234,14 +238,13 @@ class EvolveSettings(RunSettings):
             object.__setattr__(self, "policy", self.policy.removesuffix(CONTINUOUS) + CONTINUOUS)
 
     def defaults(self) -> dict[str, Any]:
-        alone = not any(self.crowds)
-        rays = "mlp:64+steering" if alone else "mlp:128+motion+steering"
-        rays += LIMIT * (len(self.crowds) > 1)
+        alone, compute = not any(self.crowds), max(self.compute, 1)  # `check` refuses less than 1
+        rays = ("mlp:64+steering" if alone else "mlp:128+motion+steering") + self._sees_besides
         usual = SearchConfig.population if alone else 128
         return {
             "policy": "cnn:8,16,32@1" if self.observation == "grid" else rays,
-            "population": round(usual * math.sqrt(max(self.compute, 1))),
-            "car_steps": 0 if self.generations else 60_000_000 * max(self.compute, 1) * len(self.crowds),
+            "population": round(usual * math.sqrt(compute)),
+            "car_steps": 0 if self.generations else 60_000_000 * compute * len(self.crowds),
         }
 
     @property
@@ -343,7 +346,7 @@ class DqnSettings(RunSettings):
                 "anneal": 4_000_000, "target_period": 500, "evaluate_every": 250_000,
             }  # fmt: skip
         return {
-            "policy": "mlp:64,64+steering" + LIMIT * (len(self.crowds) > 1),
+            "policy": "mlp:64,64+steering" + self._sees_besides,
             "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3,
             "anneal": 30_000_000, "target_period": 200, "evaluate_every": 1_000_000,
         }  # fmt: skip

@@ -353,15 +353,15 @@ def _evaluate_suite(flags: EvaluateFlags) -> int:
     )
     driven = list(roads)
     found = suite.report(champion, driven)
-    checked = suite.compared(before, found)
-    write_json(path, found)
     if flags.json:
         print(json.dumps(found))
-        return 0
-    title, crowds = f"{flags.champion} in suite {suite.NUMBER}", [cars for _, cars, _ in driven]
-    new_console().print(driving_table(title, found, found["by_road"], crowds, SimConfig().episode.target))
-    line = f"digest {found['digest'][:16]}, champion {champion.sha256[:16]}: {short_path(path)}"
-    new_console().print(line, *filter(None, [checked]), sep="\n", soft_wrap=True)
+    else:
+        title, crowds = f"{flags.champion} in suite {suite.NUMBER}", [cars for _, cars, _ in driven]
+        new_console().print(driving_table(title, found, found["by_road"], crowds, SimConfig().episode.target))
+        line = f"digest {found['digest'][:16]}, champion {champion.sha256[:16]}: {short_path(path)}"
+        lines = [line, *filter(None, [suite.compared(before, found)])]
+        new_console().print(*lines, sep="\n", soft_wrap=True)
+    write_json(path, found)  # last: what was measured is shown, also where it cannot be kept
     return 0
 
 

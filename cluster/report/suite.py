@@ -1,6 +1,6 @@
 """The suite: fixed drives in which champions of anybody are compared, and a digest by which their figures are checked.
 
-The drives never change under one number: whoever changes roads, traffic, car or the number of drives counts it up.
+Figures of one NUMBER can be compared: whoever changes roads, traffic, car or the number of drives increases it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from cluster.store.champion import Champion, drives
 from cluster.store.checkpoint import CheckpointError
 from evolution.episodes.figures import summarise
+from gridsim.config import SimConfig
 from gridsim.maps.parts import HELD_OUT_SEED
 from gridsim.maps.scenarios import ALL, Traffic
 from gridsim.packages import DISTRIBUTION
@@ -34,7 +35,7 @@ def drive(champion: Champion) -> Iterator[tuple[str, int, np.ndarray]]:
 
 def report(champion: Champion, driven: list[tuple[str, int, np.ndarray]]) -> dict[str, Any]:
     """What suite.json holds. The digest is of all drives: their distances, control steps and ends."""
-    digest, period = hashlib.sha256(), champion.in_sim("default").sim.episode.control_period
+    digest, period = hashlib.sha256(), SimConfig().episode.control_period
     for _, _, results in driven:
         for name in ("distance", "steps", "end"):
             digest.update(np.ascontiguousarray(results[name]).tobytes())

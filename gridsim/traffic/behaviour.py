@@ -277,7 +277,7 @@ def _lanes_apart(network, lane, along, target):
 
 @leaf
 def _skew(network, lane, along, target):
-    """How far (m) a neighbour's point is ahead of being beside a lane's with the same index; 0 up to SKEW."""
+    """How far (m) ahead of a place on a lane its neighbour's point with the same index lies; 0 if at most SKEW."""
     k = I(along / network.steps[lane])
     one, other = network.offsets[lane] + k, network.offsets[target] + k
     first = min(other, network.offsets[target + 1] - 2)

@@ -111,7 +111,7 @@ def may_enter(network, drivers, world, i, ego, ego_way, seconds):
         goes_first = network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds)
         if goes_first and not _has_no_room(drivers, world, world[j]):
             return False
-        behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # where the next lane comes back to this one
+        behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # no obstacle, even if the way comes back here
         # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gridsim.maps.generators.roundabout import HALF_RING, RADIUS
 from gridsim.maps.lanes import Path, sample
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, groups_of, heading, part_of
 
@@ -24,13 +25,13 @@ class Loop(NamedTuple):
     room: float  # m from its middle line to lanes of other roads, at least
 
 
-# As wide as the ring of a small roundabout, so that who can drive one can turn here; where there is no room, narrow.
-LOOPS = (Loop(10.5, 9.0, 6.5), Loop(8.0, 3.5, 4.2))
+ROOM = 4.2  # m from a narrow loop or a way round the world to lanes of other roads, at least
+NARROWEST = 3.5  # m, of such a loop or way
+# A driver who knows roundabouts can turn in a loop of that size. Where there is no room for it, the loop is narrow.
+LOOPS = (Loop(RADIUS, 2.0 * HALF_RING, 6.5), Loop(8.0, NARROWEST, ROOM))
 PARTNER = 45.0  # m between the end of a road and the beginning of the opposite direction, at most
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
 SPARE = 15.0  # m that are left of it, at least
-ROOM = 4.2  # m from a way round the world to lanes of other roads, at least
-NARROWEST = 3.5  # m, of a way round the world
 LOOP_SPEED = 30 / 3.6  # m/s, in a loop, at most
 WIDEST = 25.0  # m, of a road's end
 LONGEST = 500.0  # m, of a way round the world

@@ -68,6 +68,7 @@ def _find_conflicts(points, offsets, candidates, width, height, gap):
 
 
 def _line(lane: Lane) -> np.ndarray:
+    """A lane's middle line, float64 [n, 2], in steps of LANE_STEP at most."""
     return resampled(lane, max(math.ceil(lane.length / LANE_STEP), 1))[0]
 
 
@@ -123,7 +124,7 @@ class Conflicts:
                 self.cross[one, other] = self.cross[other, one] = True
 
     def _seen_from(self, here: int, other: int) -> np.ndarray:
-        """Another lane's line, without what is close to where it follows one or leads to it."""
+        """The line of lane `other`, without what is close to where it joins lane `here`."""
         return _beyond_joints(self.lines[other], self.follows[here, other], self.follows[other, here], self.gap)
 
     def is_loop(self, lanes: dict[str, Lane], key: str, other: str) -> bool:
@@ -355,15 +356,15 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
             continue
         zones = [conflicts.zone(key) for key in crossed]
         first, last = min(zone[0] for zone in zones) - 1.0, max(zone[1] for zone in zones) + 1.0
-        apart = any(conflicts.in_loop(key) for key in crossed)  # the lane at its end must not cross itself
+        loops = any(conflicts.in_loop(key) for key in crossed)  # a lane made longer would cross itself
         if (
-            not apart
+            not loops
             and last > length - NEAR_END
             and first > length - 2 * NEAR_END
             and _give_tail(lanes, before, group, length - first)
         ):
             continue
-        if not apart and first < NEAR_END and last < 2 * NEAR_END and _give_head(lanes, before, group, last):
+        if not loops and first < NEAR_END and last < 2 * NEAR_END and _give_head(lanes, before, group, last):
             continue
         if last < length - LEAST and last > LEAST:
             _split(lanes, group, last / length)
