@@ -6,8 +6,8 @@ kept in DIR, one JSON file per command; they are measured again only after a cha
 an interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
 commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, compute, compute16, all, other, speed, learners, comparison, pace; all by default, in some four
-hours on two cores.
+Tables: seeds, roads, compute, compute16, all, other, speed, learners, ppo, comparison, pace; all by default, in
+some four hours on two cores.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
     },
     "speed": alone("benchmarks/throughput.py --json", "benchmarks/scaling.py --json"),
     "learners": alone("benchmarks/learners.py --json"),
+    "ppo": alone("benchmarks/learners.py --roads --json"),
     "comparison": alone("gridsim-compare --seeds 5"),
     "pace": {
         "gridsim-compare": [
