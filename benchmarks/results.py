@@ -215,7 +215,11 @@ def render(rows: Mapping[str, Sequence[str]], store: Store) -> str | None:
     if "figures" in firsts[0]:
         figures = {name: value for row in firsts for name, value in row["figures"].items()}
         return "\n".join(
-            ["| figure | value |", "| --- | ---: |", *(f"| `{k}` | {v:,.2f} |" for k, v in figures.items())]
+            [
+                "| figure | value |",
+                "| --- | ---: |",
+                *(f"| `{k}` | {v:,.{3 if v < 1.0 else 2}f} |" for k, v in figures.items()),
+            ]
         )
     if "by_road" in firsts[0]["held_out"]:
         return "\n".join([HEAD_OF_ROADS, *(row for runs in whole.values() for row in rows_of_roads(runs))])
