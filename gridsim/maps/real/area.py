@@ -14,21 +14,22 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 FINE = 2  # pixels per node of the field
 PIXEL = 1.0 / (CELLS_PER_UNIT * FINE)  # m; the middle of every second pixel is a node
-SLIT = 2  # pixels around the road in which walls that are as thin on both sides are taken for gaps in the data
-ISLAND = 30.0  # m2; smaller walls inside of junctions are taken for gaps, too
+SLIT = 2  # pixels by which the road is grown and shrunk again: slits up to twice as wide, gaps in the data, are filled
+ISLAND = 30.0  # m2; smaller pieces of wall, as inside of junctions, are filled, too
 _REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, of the longest distance in the field
 
 AIR = 0.3  # m on each side of a narrow lane's cars, whose ends swing out in bends and as they change lanes
-SHARP = 0.1  # rad
+SHARP = 0.1  # rad, turn of a sharp bend, at least
 SWEPT = 2.5  # m around a sharp bend that a car's corners may pass
 _CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
-_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1
+_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1  # pixels, of the longest distance off the road
 
 
 def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.ndarray, gap: float) -> np.ndarray:
     """Clearance float32 [rows, columns] (m) at the nodes of a torus of this size (m).
 
-    Every lane has room for its cars: narrower ones become `gap` m, in which cars pass each other, and twice AIR wide.
+    Every lane has room for its cars: lanes narrower than `gap` m (`load.gap_of`) plus twice AIR are widened to that.
+    `outlines`, of junctions, are road, too.
     """
     columns, rows = (round(float(side) / PIXEL) for side in size)
     picture = Image.new("L", (columns, rows))
@@ -56,7 +57,7 @@ def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.nd
 
 
 def _window(used: np.ndarray) -> np.ndarray:
-    """Indices of what is used of a closed row of pixels, with what matters around it; even in number and at first."""
+    """Indices of the `used` pixels of a ring, and of what is near; the first and their number are multiples of FINE."""
     first, last = np.flatnonzero(used)[[0, -1]]
     if last - first + 4 * _REACH > len(used):
         first, last = 0, len(used) - 1
@@ -113,8 +114,8 @@ def _without_gaps(free: np.ndarray) -> np.ndarray:
 def _signed(free, pixel, reach, outside, fine, nodes):
     """Distance (m) of each node to the edge between road and wall, positive on the road.
 
-    It is searched for within `reach` pixels, and from places off the road within `outside` pixels. The edge is half a
-    pixel before the nearest pixel of the other kind.
+    The edge is half a pixel before the nearest pixel of the other kind. That one is looked for within `reach` pixels of
+    nodes on the road, and within `outside` pixels of others.
     """
     rows, columns = free.shape
     along = np.full((rows, columns), reach, dtype=np.uint8)

@@ -13,8 +13,8 @@ from gridsim.maps.real.lights import program
 NOT_FOR_CARS = {"sidewalk", "crosswalk", "bicycleLane", "busLane", "busStop", "border", "parking", "restricted"}
 LIMIT_SIGNS = {"274", "R2-1", "r301", "maxspeed", "max_speed", "274.1"}  # Germany and Zamunda, USA, Spain, others
 COLOURS = {"red": "r", "redYellow": "r", "yellow": "y"}
-SHORTEST_CYCLE = 20.0  # s; of a shorter one, times are in s, and not in steps
-MARK = "solid"  # a marking that may not be crossed has this in its name
+SHORTEST_CYCLE = 20.0  # s; if a cycle is shorter, its times are taken to be in s, not in steps
+MARK = "solid"  # a marking that may not be crossed has this name, or broad_ before it
 
 
 def read_commonroad(root: Element) -> RealRoad:
@@ -64,7 +64,7 @@ def read_commonroad(root: Element) -> RealRoad:
 
 
 def _program(light: Element, step: float) -> str:
-    """`Lane.light` of a traffic light whose times are in steps of so many s; "" for one that is off."""
+    """`Lane.light` of a traffic light whose times are in steps of `step` s; "" for one that is off."""
     cycle = light.find("cycle")
     if cycle is None or light.findtext("active", "true") == "false":
         return ""

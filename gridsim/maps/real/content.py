@@ -60,7 +60,7 @@ def _from_pbf(path: Path) -> bytes:
 
 def parse(path: Path, data: bytes) -> Element:
     """The root of an XML file."""
-    # Nothing that roads are kept in needs a document type; entities in it could grow without limit, or read files.
+    # No format of roads needs a document type; entities in it could grow without limit, or read files.
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data[:64]:
         raise GridSimError(f"{path}: a map is XML in UTF-8 without a document type or entities")
     try:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-RETURN = 4.0  # m that a line may go back where two lanes meet, because a file's nodes are closer than its junctions
-RETURN_COSINE = -0.2  # of the angle at such a point
+# m, the longest way back that is removed where lanes are joined; it arises if nodes are closer than junctions are wide
+RETURN = 4.0
+RETURN_COSINE = -0.2  # of the angle by which the line turns at such a point, at most
 
 
 @dataclass
@@ -22,9 +23,9 @@ class Lane:
     successors: list[str] = field(default_factory=list)
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
-    junction: str | None = None  # of the file; "": the lane is outside of junctions; None: the format does not tell
-    links: frozenset[str] = frozenset()  # ways through junctions of the file that it is part of
-    yields: frozenset[str] = frozenset()  # those to which the file has it give way
+    junction: str | None = None  # the junction of the file that it is in; "": none; None: the format does not tell
+    links: frozenset[str] = frozenset()  # names of the file's ways through junctions that are part of it
+    yields: frozenset[str] = frozenset()  # those to which it gives way, as the file says
     light: str = ""  # the program by which cars enter it: g, y or r for each second, repeated; "": no light
 
     @property
@@ -48,7 +49,7 @@ class RealRoad:
     degrees: tuple[
         float, ...
     ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
-    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0 as the lanes lie
+    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0: found from the lanes
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property
@@ -58,7 +59,7 @@ class RealRoad:
 
 
 def paired(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two bounds with the same number of points, at the shares of their lengths at which either has one."""
+    """Two bounds, resampled: both get a point at each share of their lengths at which either has one."""
     shares = [_shares(bound) for bound in (left, right)]
     both = np.unique(np.round(np.concatenate(shares), 9))
     return tuple(

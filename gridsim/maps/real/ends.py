@@ -1,4 +1,4 @@
-"""Roads that end at the edge of a file: turning loops, and ways round the world, so that one can drive on."""
+"""Roads that end at a file's edge get turning loops, or ways round the world: across the sides of the torus."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Loop(NamedTuple):
 
 ROOM = 4.2  # m from a narrow loop or a way round the world to lanes of other roads, at least
 NARROWEST = 3.5  # m, of such a loop or way
-# A driver who knows roundabouts can turn in a loop of that size. Where there is no room for it, the loop is narrow.
+# The first is as large as generated roundabouts, so that who drives these can turn in it; the second needs less room.
 LOOPS = (Loop(RADIUS, 2.0 * HALF_RING, 6.5), Loop(8.0, NARROWEST, ROOM))
 PARTNER = 45.0  # m between the end of a road and the beginning of the opposite direction, at most
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
 SPARE = 15.0  # m that are left of it, at least
 LOOP_SPEED = 30 / 3.6  # m/s, in a loop, at most
-WIDEST = 25.0  # m, of a road's end
+WIDEST = 25.0  # m; lanes that end closer together than this end at the same end of a road
 LONGEST = 500.0  # m, of a way round the world
 
 Pose = tuple[float, float, float]
@@ -84,7 +84,7 @@ class _Ground:
         return points if self.sides is None else np.mod(np.mod(points, self.sides), self.sides)
 
     def is_free(self, line: np.ndarray, but: set[str], room: float) -> bool:
-        """Whether a line [n, 2] keeps `room` m from all lanes but some."""
+        """Whether a line [n, 2] keeps `room` m from all lanes except those in `but`."""
         line = self._within(line)
         near = self.tree.query_ball_point(line, room)
         if not all(self.keys[self.owner[k]] in but for found in near for k in found):
@@ -100,7 +100,7 @@ def _dense(line: np.ndarray) -> np.ndarray:
 
 
 def _open_groups(lanes: dict[str, Lane]) -> tuple[list[list[str]], list[list[str]]]:
-    """Groups of lanes side by side of which none leads on, and those to which none leads."""
+    """Groups of lanes side by side: those without successors, and those without predecessors; none under 1 m long."""
     followed = {key for lane in lanes.values() for key in lane.successors}
     groups = [group for group in groups_of(lanes) if min(lanes[key].length for key in group) > 1.0]
     out = [group for group in groups if not any(lanes[key].successors for key in group)]
@@ -170,7 +170,7 @@ def _beside(one: Lane, other: Lane) -> bool:
 def _connections(
     lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, narrowest: float, shift: np.ndarray
 ) -> list[tuple[Lane, str]]:
-    """Lanes from the ends of some to the beginnings of others, moved by `shift`; each with where it begins."""
+    """New lanes from the ends of `one` to the beginnings of `other`, moved by `shift`; each with its predecessor."""
 
     def away(keys: list[str], at: int, to: np.ndarray) -> list[str]:
         return sorted(keys, key=lambda key: float(np.hypot(*(lanes[key].centre[at, :2] - to))))

@@ -15,14 +15,14 @@ from gridsim.maps.real.description import Lane
 from gridsim.maps.roads import Road, clearances
 
 SHOWS = {"g": GO, "y": CLEARING, "r": STOP}
-LONGEST_PHASE, USUAL_PHASE = 300.0, 30.0  # s; a longer one would end when somebody asks for it
+LONGEST_PHASE, USUAL_PHASE = 300.0, 30.0  # s; a longer phase ends on demand, and is taken to last the usual time
 LONGEST_CYCLE = 600  # s
 REACH = 12.0  # m from the middle of a lane to the end of its stop line, at most
 APART = 1.6  # m from a stop line's end to the middle of another lane that leads the same way, at least
 
 
 def program(phases: Sequence[tuple[str, float]], offset: float = 0.0) -> str:
-    """`Lane.light` of phases: colours and durations (s), from `offset` (s) on; "" for a light that never changes."""
+    """`Lane.light` of phases: colours and durations (s); the first begins at `offset` (s). "": it never changes."""
     times = [USUAL_PHASE if time > LONGEST_PHASE else max(time, 0.0) for _, time in phases]
     if not 1.0 <= sum(times) <= LONGEST_CYCLE or len({colour for colour, _ in phases}) < 2:
         return ""
@@ -48,7 +48,7 @@ def with_lights(network: Network, lanes: dict[str, Lane], road: Road) -> Network
             continue
         text = _together([light[k] for k in after])
         line = ways.stop_line(lane, after)
-        if "r" in text and line not in lines:  # lanes that end at one place have one
+        if "r" in text and line not in lines:  # lanes that end at one place have one line
             programs.append(text)
             lines.append(line)
     own = sorted(set(light) - {""})
@@ -85,7 +85,7 @@ class _Ways:
     def stop_line(self, before: int, after: list[int]) -> list[float]:
         """A row of `Network.lines` at the end of a lane: to the edge of the road, or to lanes that go the same way.
 
-        Lanes that come the other way are crossed: who would overtake on them must stop, too.
+        The line also crosses lanes that come the other way, so that a car that overtakes on these must stop, too.
         """
         end = self.network.offsets[before + 1] - 1
         place, along = self.network.points[end].astype(float), self.heading[end]

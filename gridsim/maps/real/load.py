@@ -40,17 +40,17 @@ NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and
 MAX_NODES = 1 << 24  # of the field: 4 square km
 SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
-SLOWEST_LIMIT = 15 / 3.6  # m/s; what is below, no road has: a file has it in a wrong unit
+SLOWEST_LIMIT = 15 / 3.6  # m/s; a lower limit must be in a wrong unit, and counts as none
 SPEEDS = 0.45, 0.95  # the interval within which speed counts, as shares of the usual limit
 SIDES = {"right": 1.0, "left": -1.0}
-FASTEST = 27.0  # m/s, of the interval
+FASTEST = 27.0  # m/s, the upper end of the interval, at most
 
 
 def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: float | None = None) -> RealRoad:
-    """The roads of a file as it has them, with a crop those in a square: its middle and its side in m.
+    """The roads of a file as it has them; with a `crop` only those in a square, given by its middle and its side (m).
 
-    The middle is latitude and longitude where the file's places are, else x and y in m. `hand` is the side on which
-    traffic drives, if the file does not decide it: 1 right, -1 left.
+    The middle is latitude and longitude if the file has these, else x and y in m. `hand` is the side on which traffic
+    drives: 1 right, -1 left; None: the file decides.
     """
     data = read_content(path)
     root = parse(path, data)
@@ -68,12 +68,12 @@ def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: 
 
 @dataclass
 class Prepared:
-    """A real road made ready: everything of a map that does not depend on the configuration."""
+    """A real road made ready: everything of a map that depends on nothing of the configuration but `gap_of`."""
 
     format: str
     notes: list[str]  # of `RealRoad`
     origin: np.ndarray  # float64 [2], m: the file's coordinates of the map's lower left corner
-    nodes: np.ndarray  # clearance float32 [rows, columns], multiples of a step of the field
+    nodes: np.ndarray  # clearance float32 [rows, columns]; saved in steps of the field
     network: Network  # without `speeds`, `clear` and `room`
     limits: np.ndarray  # float64 [lanes], m/s
 
@@ -140,7 +140,7 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     for lane in road.lanes.values():
         lane.left, lane.right = lane.left - shift, lane.right - shift
     used = {lane.junction for lane in road.lanes.values()}
-    # What of a junction lies beyond the lanes that are left would come in again on the other side of the torus.
+    # Parts of a junction far beyond the lanes that are left would come in again on the other side of the torus.
     inside = (np.clip(road.junctions[key], low - OUTSIDE, high + OUTSIDE) for key in road.junctions if key in used)
     outlines = [outline - origin for outline in inside]
     hand = road.hand or hand_of(road.lanes)
@@ -169,7 +169,7 @@ def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
 
 
 def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
-    """The map."""
+    """The map of a prepared road: traffic's speeds and the speed interval follow from the limits."""
     network, limits = prepared.network, prepared.limits
     if not config.traffic.lights:
         network = network._replace(**no_lights(len(limits)))
@@ -177,7 +177,7 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
     order = np.argsort(limits)
     usual = float(limits[order][np.searchsorted(np.cumsum(lengths[order]), lengths.sum() / 2)])
     low, high = (min(share * usual, FASTEST * share / SPEEDS[1]) for share in SPEEDS)
-    # On roads that end, one turns and drives back.
+    # Where a road ends, a car turns and drives back: that is new ground (`ways`).
     road = make_road(prepared.nodes, (low, high), 2.0 * HALF_WALL, ways=2)
     paces = (limits / usual * TRAFFIC_PACE * (low + high)).astype(np.float32)
     return Map(name, 0, road, Strips.of(), make_network(network, road, config, paces))
@@ -186,7 +186,7 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
 def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, float | None]:
     """The path of a scenario's name, its crop and its side of the road.
 
-    It may end in @LAT,LON,METRES or @X,Y,METRES, and in @left or @right.
+    The name may end in @LAT,LON,METRES or @X,Y,METRES, and in @left or @right.
     """
     side = re.search(r"@(left|right)(?=@|$)", name)
     if side:
@@ -219,7 +219,7 @@ def load(name: str, digest: str, config: SimConfig) -> Map:
 
 
 def described(name: str, config: SimConfig) -> Prepared:
-    """What was read of a file."""
+    """What `prepare` makes of a file, with the notes on what it read."""
     return prepared(os.path.abspath(name), file_digest(name), gap_of(config))
 
 
@@ -229,7 +229,7 @@ def gap_of(config: SimConfig) -> float:
 
 
 def cached(name: str, digest: str, gap: float) -> Path:
-    """Where what is made of a file is kept."""
+    """The path in the cache of what `prepare` makes of a file."""
     key = hashlib.sha256(f"{digest} {split_name(name)[1:]} {gap}".encode()).hexdigest()[:32]
     return CACHE_FOLDER / f"road-{key}.npz"
 

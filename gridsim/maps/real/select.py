@@ -13,20 +13,20 @@ from gridsim.maps.real.description import Lane, RealRoad, groups_of, heading, pr
 
 TIGHTEST = 3.5  # m, the least radius of a turn that traffic drives
 TURN = 1.75  # rad, 100 degrees: what may be turned within an arc of that radius
-NEARLY = 0.75  # of the largest component's length
-APART = 2.5  # m of height between two ways, at least, of which one is above the other
+NEARLY = 0.75  # of the largest component's length: components this long are kept, too
+APART = 2.5  # m of height between two ways, at least, if one passes above the other
 JOINT = 0.01  # m of the lanes before and after a lane that are looked at, for their directions
-END = 3.0  # m from a lane's end, within which lanes meet and do not cross
+END = 3.0  # m; lanes that cross within this + 8 m of an end meet there
 
 
 def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
-    """Copies of these lanes alone, without references to others."""
+    """Copies of the lanes `kept`, without references to others."""
     lanes = {key: replace(lane) for key, lane in lanes.items() if key in kept}
     for lane in lanes.values():
         lane.successors = [key for key in dict.fromkeys(lane.successors) if key in kept]
         lane.left_lane = lane.left_lane if lane.left_lane in kept else ""
         lane.right_lane = lane.right_lane if lane.right_lane in kept else ""
-    for key, lane in lanes.items():  # a neighbour that does not confirm it is none
+    for key, lane in lanes.items():  # neighbours stay so only if each names the other
         if lane.left_lane and lanes[lane.left_lane].right_lane != key:
             lane.left_lane = ""
         if lane.right_lane and lanes[lane.right_lane].left_lane != key:
@@ -58,7 +58,7 @@ def without_tight_turns(road: RealRoad) -> None:
 
 
 def _is_tight(line: np.ndarray) -> bool:
-    """Whether a polyline [n, 2] turns by more than TURN within the arc that a circle of radius TIGHTEST has for it."""
+    """Whether a polyline [n, 2] turns by more than TURN within the length of such an arc of radius TIGHTEST."""
     step = np.diff(line, axis=0)
     angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))])
@@ -68,7 +68,7 @@ def _is_tight(line: np.ndarray) -> bool:
 
 @njit
 def _crossing(one, other):
-    """Points (indices of segments) at which two polylines [n, 2] cross: i, j of the first; -1, -1 if they do not."""
+    """Indices i, j of the first segments at which two polylines [n, 2] cross; -1, -1 if they do not."""
     for i in range(len(one) - 1):
         ax, ay, bx, by = one[i, 0], one[i, 1], one[i + 1, 0] - one[i, 0], one[i + 1, 1] - one[i, 1]
         for j in range(len(other) - 1):
@@ -108,7 +108,10 @@ def on_one_level(road: RealRoad) -> None:
 
 
 def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_line: np.ndarray) -> str:
-    """Which of two lanes has to go, because it passes under the other; "" for none."""
+    """Which of two lanes has to go, because it passes under the other; "" for none.
+
+    If heights do not tell, but they cross far from their ends and not in one junction: the one with the lower limit.
+    """
     one, two = road.lanes[key], road.lanes[other]
     if other in one.successors or key in two.successors:
         return ""
@@ -128,7 +131,7 @@ def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_lin
 
 
 def largest_connected(lanes: dict[str, Lane]) -> set[str]:
-    """The largest part (m) that hangs together at all."""
+    """The largest part (by m of lanes) that is connected, whatever the directions of its lanes."""
     return _largest(lanes, "weak")
 
 

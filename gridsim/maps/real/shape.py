@@ -19,7 +19,7 @@ from gridsim.maps.real.select import on_rings
 
 APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
 LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
-DIVIDED = 0.5  # m between two lanes from which cars do not change from one to the other
+DIVIDED = 0.5  # m between the sides of two lanes, beyond which cars do not change from one to the other
 ACROSS = 75.0  # m, of ways across a junction that are made one lane, at most
 ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
 WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
@@ -73,7 +73,7 @@ def _line(lane: Lane) -> np.ndarray:
 
 
 def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.ndarray:
-    """A lane's line without what is close to its first point, and to its last one, where it joins a certain other."""
+    """A lane's line without what is close to its first point, if `first`, and to its last one, if `last`."""
     for end, joins in ((0, first), (-1, last)):
         if joins and len(line):
             far = np.flatnonzero(np.hypot(*(line - line[end]).T) >= 2.0 * gap)
@@ -84,7 +84,7 @@ def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.
 class Conflicts:
     """Which lanes may collide: they come closer than `gap` m, and are not side by side.
 
-    Of two that follow each other, what is close to where they do so does not count.
+    If one follows the other, what is close to the point where they join does not count.
     """
 
     def __init__(self, lanes: dict[str, Lane], gap: float, size: np.ndarray):
@@ -108,7 +108,7 @@ class Conflicts:
         self._add_loops()
 
     def _following(self, lanes: dict[str, Lane]) -> Iterable[tuple[str, str]]:
-        """Lanes and what follows them, also after a short one."""
+        """Pairs of a lane and one that follows it, at once or after a short lane."""
         for key, lane in lanes.items():
             for other in lane.successors:
                 yield key, other
@@ -128,7 +128,7 @@ class Conflicts:
         return _beyond_joints(self.lines[other], self.follows[here, other], self.follows[other, here], self.gap)
 
     def is_loop(self, lanes: dict[str, Lane], key: str, other: str) -> bool:
-        """Whether a lane that follows another comes back to it: one lane of both would cross itself."""
+        """Whether lane `other`, which follows `key`, comes back to it: joined, they would cross themselves."""
         ring = key in lanes[other].successors
         one = _beyond_joints(_line(lanes[key]), ring, True, self.gap)
         return bool(_near(one, _beyond_joints(_line(lanes[other]), True, ring, self.gap), *self.size, self.gap))
@@ -172,7 +172,10 @@ def boxes_of(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[str]]) -> list[str] | None:
-    """The lanes that alone continue those of a group, in the same order side by side; None if there are none such."""
+    """The lanes that follow a group, if they are a group in the same order; otherwise None.
+
+    Each must be the only successor of its lane and have no other predecessor; no further lane may be beside them.
+    """
     onward = [lanes[key].successors for key in group]
     if any(len(keys) != 1 or len(before[keys[0]]) != 1 for keys in onward):
         return None
@@ -184,7 +187,7 @@ def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[st
 
 
 def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Join lanes to whole stretches of road; lanes that others cross only if they are short."""
+    """Join lanes that follow each other: up to WHOLE m, and none that conflicts, unless one is shorter than LEAST."""
     crossed = {key for key in lanes if key in conflicts}
     before = predecessors(lanes)
     for group in groups_of(lanes):
@@ -242,9 +245,9 @@ def _absorb(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Make lanes that follow each other inside of a junction one way across it, on which no car has to wait.
+    """Join lanes that follow each other inside of a junction to one lane across it, on which no car has to wait.
 
-    A lane before a fork becomes one for each branch. In roundabouts cars wait.
+    A lane before a fork becomes one for each branch. Roundabouts stay as they are: in them, cars may wait.
     """
     before = predecessors(lanes)
     crossed = {key for key in lanes if key in conflicts}
@@ -286,7 +289,7 @@ def _is_alone(lane: Lane) -> bool:
 
 
 def _give_tail(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
-    """Make the last `length` m of a road part of the lanes that go on from it, if it is theirs alone."""
+    """Make the last `length` m of a road part of its successors, if these follow only it; returns whether it did."""
     onward = [(key, s) for key in group for s in lanes[key].successors]
     if min(lanes[key].length for key in group) < length + LEAST or any(
         before[s] != [key] or s in group or not _is_alone(lanes[s]) for key, s in onward
@@ -302,7 +305,7 @@ def _give_tail(lanes: dict[str, Lane], before: dict[str, list[str]], group: list
 
 
 def _give_head(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
-    """Make the first `length` m of a road part of the lanes that lead to it, if they lead to it alone."""
+    """Make the first `length` m of a road part of the lanes that lead to it, if only to it; returns whether it did."""
     if min(lanes[key].length for key in group) < length + LEAST or any(
         lanes[p].successors != [key] or p in group or not _is_alone(lanes[p]) for key in group for p in before[key]
     ):
@@ -347,7 +350,7 @@ def _lengthen(lanes: dict[str, Lane]) -> None:
 
 
 def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Make what is crossed of a road part of the junctions at its ends, or a lane of its own."""
+    """Make the part of a road that other lanes cross a part of the junction at its end, or a lane of its own."""
     before = predecessors(lanes)
     for group in groups_of(lanes):
         crossed = [key for key in group if key in conflicts]
@@ -374,7 +377,7 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _unlink(lanes: dict[str, Lane], gap: float) -> None:
-    """Take lanes that run into one another, or apart, for no neighbours."""
+    """Let lanes that run into one another, or apart, be neighbours no longer."""
     for group in groups_of(lanes):
         for left, right in pairwise(group):
             n = max(math.ceil(lanes[left].length / LANE_STEP), 1)
@@ -385,7 +388,10 @@ def _unlink(lanes: dict[str, Lane], gap: float) -> None:
 
 
 def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[str, Lane], Conflicts]:
-    """Lanes as traffic needs them, and which of them may collide; `gap` (m) between middle lines, size of the torus."""
+    """Lanes as traffic needs them, and which of them may collide.
+
+    `gap`: the distance (m) between middle lines below which lanes conflict; `size` [2]: sides (m) of the torus.
+    """
     lanes = {key: replace(lane, successors=list(lane.successors)) for key, lane in lanes.items()}
     _unlink(lanes, gap)
     conflicts = Conflicts(lanes, gap, size)
@@ -403,7 +409,7 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
 
 
 def _yields(lanes: list[Lane], cross: np.ndarray) -> np.ndarray:
-    """`Network.yields` of lanes that conflict; of two that give way to each other, as ways over several junctions may,
+    """`Network.yields` of lanes that conflict. If two would give way to each other, as ways over several junctions may,
     neither does.
     """
     gives_way = np.zeros_like(cross)
@@ -424,7 +430,7 @@ def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Net
         intervals.update(dict.fromkeys(group, max(math.ceil(longest / LANE_STEP - 1e-9), 1)))
     lines = [resampled(lane, intervals[key])[0] for key, lane in lanes.items()]
     index = conflicts.index
-    for key, lane in lanes.items():  # where a file leaves a gap, or its bounds do not quite meet
+    for key, lane in lanes.items():  # close gaps, where a file's bounds do not quite meet
         for s in lane.successors:
             away = lines[index[key]][-1] - lines[index[s]][0]
             lines[index[s]][0] += _short(away, conflicts.size)

@@ -65,9 +65,10 @@ def convert(
     crop: tuple[float, float, float] | None = None,
     hand: float | None = None,
 ) -> RealRoad:
-    """An OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file; of the former with a crop (degrees, m) a part.
+    """The roads of an OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file.
 
-    `hand` decides on which side traffic drives: 1 right, -1 left; None: the file does.
+    `crop`, for OpenStreetMap only, is a square: latitude and longitude of its middle, and its side (m). `hand` is the
+    side on which traffic drives: 1 right, -1 left; None: the file decides.
     """
     options, notes = list(OPTIONS[kind]), []
     if kind == "osm":
@@ -84,7 +85,7 @@ def convert(
     else:
         lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data if hand is None else hand < 0.0
     # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
-    # what it makes of the file as one that keeps right is right but for the direction.
+    # what it makes of the file as one that keeps right is correct, except that lanes lead the wrong way.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
     options += ["--lefthand"] * (lefthand and not turned)
     net = _netconvert(path, data, kind, options)
@@ -142,7 +143,7 @@ def _limits(root: Element) -> dict[str, float]:
 
 
 def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
-    """A SUMO net. Each connection is a lane of its own through its junction; `limits` are by the road that it was."""
+    """A SUMO net. Each connection is a lane of its own through its junction; `limits`: m/s by OpenDRIVE road."""
     inner: dict[str, Element] = {}
     lanes: dict[str, Lane] = {}
     numbered: dict[tuple[str, int], str] = {}
@@ -235,7 +236,7 @@ def _name(connection: Element) -> str:
 
 
 def _right_of_way(root: Element) -> dict[str, frozenset[str]]:
-    """To which connections each has to give way: junctions number theirs by the lanes that lead to them."""
+    """The connections to which each gives way. A junction numbers its own in the order of the lanes that lead to it."""
     of_lane, yields = defaultdict(list), {}
     for connection in root.iterfind("connection"):
         of_lane[f"{connection.get('from')}_{connection.get('fromLane')}"].append(_name(connection))
