@@ -48,7 +48,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
 
 @njit
 def road_of(atlas: Atlas, m: int) -> Road:
-    """Map m of an atlas."""
+    """The road of map m of an atlas."""
     field, sides, s = atlas.field[atlas.bounds[m, 0] : atlas.bounds[m + 1, 0]], atlas.sides[m], atlas.sizes[m]
     return Road(field, sides[0], sides[1], s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
 

@@ -21,15 +21,15 @@ MARGIN = 0.3  # free around a car, where we choose its place
 FAR = 30.0  # least extent of a road; where all is a dead end, a car can drive on this far from each start
 
 _CORNERS_TOO = np.ones((3, 3))  # a node's neighbours include those across its corners
-_LEAST_DRAWING = 0.05  # share of the road that a drawing encloses, at least
+_LEAST_DRAWING = 0.05  # least share of the road that a drawing must enclose, or nothing around it is closed
 
-_SIDE = 2  # nodes, of the cells at which dead ends are looked for
-_MOST_CELLS = 1 << 19  # of road; to look for dead ends among more would take too much memory
+_SIDE = 2  # nodes along a side of the cells in which dead ends are looked for
+_MOST_CELLS = 1 << 19  # of road; with more, nothing is closed, as the search for dead ends would take too much memory
 _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
 _STRIDE = 1.5  # between two places of an arc that must be free, at most: no wall fits between them
 _SLACK = 0.5  # of road kept beside the places where a car fits: cells are coarse, and edges stay as they are drawn
-# Room on both sides of a car, and the radius of its bends relative to its tightest one.
+# Room on both sides of a car, and the radius of its bends relative to that of its tightest bend.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 
 
@@ -48,7 +48,7 @@ def without_surroundings(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarra
 
     The surroundings are what a disc can reach from outside; it is so large that it does not slip through gaps in an
     outline. Of the regions that the drawing encloses, those that have no wall in common with the surroundings are
-    closed, too, such as the middle of a race track between two lines.
+    closed, too, such as the middle of a race track between two lines. If hardly any road is inside, nothing is closed.
     """
     room = needed(vehicle)
     reach = math.ceil(DEEPEST / NODE) + 1
@@ -97,9 +97,9 @@ def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.nda
 
     What stays is the largest part of the road on which a car can drive forwards from anywhere to anywhere (strongly
     connected). The car drives easy bends with much room beside it; if hard ones leave more than twice as much road, it
-    drives those. Where all road is a dead end, nothing is closed.
-    Returns: the field; and bool [headings, cells y, cells x], from where a car can drive on, within what stays, or if
-    nothing is closed for FAR.
+    drives those. Nothing is closed if all road is a dead end, or if the road has more than _MOST_CELLS cells.
+    Returns: the field; and bool [headings, cells y, cells x], from where a car can drive on: within what stays; or if
+    all road is a dead end, for FAR; or if there are too many cells, True everywhere.
     """
     clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]  # of a cell: that of its freest node
     if np.count_nonzero(clearance >= needed(vehicle)) > _MOST_CELLS:

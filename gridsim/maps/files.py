@@ -54,7 +54,7 @@ SHORTEST_SIDE = 16  # units
 UNKNOWN = 205  # of 255, the grey of unknown pixels in maps that robots save
 ALIKE = 0.8  # similarity (`difflib.SequenceMatcher.ratio`) above which an unknown key is a known one, misspelt
 MOST_BORDER = 0.5  # share of road on a picture's border, above which the border is taken for the surroundings
-MOST_CLOSED = 0.05  # share of the road that may be closed without a word
+MOST_CLOSED = 0.05  # share of the road; if as much is closed, or more, there is a warning
 
 
 class MapWarning(UserWarning):
@@ -71,10 +71,10 @@ class MapFile:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     negate: bool = False  # whether dark pixels are road
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
-    unknown: bool = False  # whether pixels of the grey UNKNOWN are none, however dark that is
+    unknown: bool = False  # whether pixels of the grey UNKNOWN are wall, whatever the threshold says
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: Sequence[Sequence[float]] = ()
-    speed: tuple[float, float] | None = None  # m/s, the speed interval; FILE_SPEEDS, for small cars less
+    speed: tuple[float, float] | None = None  # m/s, the speed interval; None: `SimConfig.file_speeds`
     ignored: Sequence[str] = ()  # keys of its YAML that mean nothing here
 
 
@@ -158,7 +158,7 @@ def _checked(path: Path, values: Any) -> MapFile:
 
 
 def _image_path(path: Path, image: Any) -> Path:
-    """The path of a YAML's picture: in its folder or below, or the same file name there, of another machine's path."""
+    """The path of a YAML's picture, in its folder or below; else that of a picture of the same name in the folder."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
         raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {shown(image)}")
     try:
@@ -244,8 +244,9 @@ def _warnings(
 ) -> Iterator[str]:
     """What a user should know of a map, each a sentence after its name.
 
-    Args: share of road on the picture's border, and whether what is wall may be the road; share of the road that is
-    closed as dead ends; the road's length, and that within which the same ground does not count again (m).
+    Args: `border`, the share of road on the picture's border; `inverted`, whether road and wall seem exchanged;
+    `closed`, the share of the road that is closed; `length` of the road, and `revisit`, within which the same ground
+    does not count again (m).
     """
     if file.ignored:
         yield f"has keys in its YAML that mean nothing here: {', '.join(file.ignored)}"

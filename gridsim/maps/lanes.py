@@ -29,7 +29,7 @@ class Scenario(NamedTuple):
     layout: Callable[[np.random.Generator], Plan]
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int = 0  # default number of other cars
-    usual_traffic: int = 6  # the number by the name `usual`, if the default is none
+    usual_traffic: int = 6  # the number that `usual` means, if the default is 0
     thinnest: float = THICK_WALL  # m, of its walls and parked cars
 
 

@@ -1,8 +1,9 @@
 """Traffic lights: programs that repeat, and the stop lines that they close. A network without lines has none.
 
-A stop line is a wall that only those see who drive towards it, while its light is not green, and that they must not
-cross while it is red. It reaches across the road, so that nobody passes beside it. All lights of a map share one clock,
-`state.CLOCK`, whose beginning follows from an episode's start: the same start has the same lights, whoever drives.
+While its light is not green, a stop line is a wall for the sensors of cars that drive towards it; while the light is
+red, they must not cross it. It reaches across the road, so that nobody passes beside it. All lights of a map share one
+clock, `state.CLOCK`, whose beginning follows from an episode's start: the same start has the same lights, whoever
+drives.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ NO_LINE = F(1e9)  # m, the way to a stop line where there is none
 
 
 def no_lights(lanes: int) -> dict[str, Any]:
-    """The part of a Network with so many lanes that says that it has no lights."""
+    """The fields of a Network with this number of lanes that hold its lights: none."""
     return {
         "lines": np.zeros((0, 5), dtype=np.float32),
         "signals": np.full(lanes, -1, dtype=np.int32),
@@ -73,7 +74,7 @@ def way_to_line(network, seconds, least, x, y, cosine, sine):
 def crosses_line(network, seconds, car, front, x, y, cosine, sine):
     """Whether a car's front, `front` m ahead of its middle, crosses the stop line of a red light.
 
-    Its way is from the car's state to a pose near by, which need not be wrapped over the torus.
+    The car goes from the pose of its state to the given one near by, which need not be wrapped over the torus.
     """
     from_x, from_y = car[X] + front * car[COS], car[Y] + front * car[SIN]
     to_x, to_y = x + front * cosine, y + front * sine

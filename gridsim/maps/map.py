@@ -27,8 +27,8 @@ class Map:
     torus: bool = True  # whether leaving on one side means entering on the other
     # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
-    # bool [n], of a map from a file: on which steps between the network's points, or else at which `starts`, episodes
-    # begin; empty: on all.
+    # bool [n], of a map from a file: whether episodes begin on each step between the network's points, or without lanes
+    # at each of `starts`; empty: everywhere.
     begins: np.ndarray = field(default_factory=lambda: freeze(np.zeros(0, dtype=bool)))
 
     @property
@@ -50,7 +50,7 @@ class Map:
 
     @cached_property
     def starts_mileage(self) -> np.ndarray:
-        """`mileage` of where episodes may begin."""
+        """As `mileage`, but steps on which no episode begins have length 0."""
         if not len(self.begins):
             return self.mileage
         return freeze(np.concatenate([[0.0], np.cumsum(np.diff(self.mileage) * self.begins)]))
@@ -122,7 +122,7 @@ def _starts_at(points, mileage, shares, starts):
 
 
 def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5], at rest, at these shares float64 [n] in [0, 1) of the length of lanes to begin on.
+    """Starts float32 [n, 5], at rest, at shares float64 [n] in [0, 1) of the length of lanes on which episodes begin.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
     without lanes, shares index `Map.starts`.

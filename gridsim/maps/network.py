@@ -22,7 +22,7 @@ _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's s
 class Network(NamedTuple):
     """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
 
-    As kernels read them: arrays read-only and C-contiguous. A map's `speeds`, `clear` and `room` are `make_network`'s.
+    As kernels read them: arrays read-only and C-contiguous. `make_network` computes `speeds`, `clear` and `room`.
     """
 
     points: np.ndarray  # float32 [n, 2], m; those of a lane in driving direction, not wrapped over the torus
@@ -35,7 +35,8 @@ class Network(NamedTuple):
     right: np.ndarray  # the same for the lane to the right
     crossing_offsets: np.ndarray  # int32 [lanes + 1], where each lane's part of `crossings` begins
     # int32 [c], for each lane the lanes with which it conflicts in a junction: they cross it or merge into its end.
-    # Lanes with the same beginning, predecessors, successors and neighbours are not among them.
+    # Lanes with the same beginning, predecessors, successors and neighbours are not among them; but on real roads, all
+    # of these except neighbours are, if they come close once more (`real.shape.Conflicts`).
     crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
     yields: np.ndarray  # uint8 [c], whether cars on this lane give way to those of that one: `YIELDS`; [0]: none does
@@ -92,7 +93,7 @@ def _speed_profile(points, offsets, steps, successors, tops, lateral, comfort, s
 
 @njit
 def _ease(offsets, steps, successors, slope, room):
-    """Limit the slope of the room on the right (m per m of lane), also from lane to lane."""
+    """Limit the slope of `room` (m per m of lane), also from lane to lane."""
     lanes = offsets.shape[0] - 1
     for _ in range(4):
         for lane in range(lanes):
@@ -161,7 +162,7 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
 def make_network(lanes: Network, road: Road, config: SimConfig, paces: np.ndarray | None = None) -> Network:
     """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`.
 
-    `paces` float32 [lanes]: traffic's speed (m/s) on straights, where it is not the same on all lanes.
+    `paces` float32 [lanes]: traffic's speed (m/s) on straights; None: from the road's speed interval, on all lanes.
     """
     traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
@@ -233,7 +234,7 @@ def successor(network, lane, number):
 
 @leaf
 def to_side(network, shift):
-    """A shift to the left as one away from the side of the road on which traffic drives, or back."""
+    """Convert a shift (m) to the left to one away from traffic's side of the road, or back: -shift if that is left."""
     return shift if network.hand > ZERO else -shift
 
 

@@ -26,12 +26,12 @@ YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
 # A square of a file: its path, middle and side.
 CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)(?:@left|@right)?")
-_TURNS = 0, 1, 2, 0, 0  # the parts of files in turn, and of regions along a row
+_TURNS = 0, 1, 2, 0, 0  # parts (`part_of`): files get them in turn, and so do regions along a row
 _REGIONS = 10  # along the longer side of a map
 
 
 def roads_of(name: str) -> list[str]:
-    """The roads that a scenario's name lists, separated by commas, which are also in a CROP and in names of files."""
+    """The roads that a scenario's name lists, separated by commas. A CROP has commas, too, and a file's name may."""
     words, roads = [name] if os.path.exists(name) else name.split(","), list[str]()
     while words:
         n = 3 if CROP.fullmatch(",".join(words[:3])) else 1
@@ -41,23 +41,23 @@ def roads_of(name: str) -> list[str]:
 
 
 def road_number(seed: int, roads: int) -> int:
-    """Which of so many roads the map of a seed is of."""
+    """Which of a scenario's roads a seed is for, as a number from 0; `roads` is how many there are."""
     return (seed - FIRST_SEEDS[part_of(seed)]) % roads
 
 
 def seed_on(number: int, roads: int, own: int) -> int:
-    """The seed of the map that a road, of so many, has for its own seed."""
+    """The scenario's seed for the map that road `number`, of `roads`, has for its `own` seed."""
     first = FIRST_SEEDS[part_of(own)]
     return first + (own - first) * roads + number
 
 
 def seeds_on(own: range, roads: int) -> range:
-    """The seeds of the maps that so many roads have for a range of their own seeds."""
+    """The scenario's seeds for the maps that each of `roads` roads has for a range of its own seeds."""
     return range(seed_on(0, roads, own.start), seed_on(0, roads, own.stop))
 
 
 def road_of(name: str, seed: int) -> tuple[str, int]:
-    """The road that the map of a seed is of, and its own seed of that map."""
+    """The road of a scenario that a seed is for, and that road's own seed."""
     roads, first = roads_of(name), FIRST_SEEDS[part_of(seed)]
     return roads[road_number(seed, len(roads))], first + (seed - first) // len(roads)
 
@@ -86,7 +86,7 @@ def files_of(name: str) -> list[str]:
 
 
 def divided(name: str) -> list[list[str]]:
-    """The map files of a path, of each part. They do not depend on a run's seed, so that runs can be compared."""
+    """The map files of a path, a list for each part: the same whatever a run's seed, so that runs can be compared."""
     files = files_of(name)
     if len(files) == 1:
         return [files] * len(FIRST_SEEDS)
@@ -100,7 +100,7 @@ def part_of(seed: int) -> int:
 
 
 def seed_of_map(name: str, seed: int) -> int:
-    """The smallest seed of the map that a seed has: that seed itself for generated roads."""
+    """The smallest seed of the same part that gives the same map; for a generated road, the seed itself."""
     if (roads := len(roads_of(name))) > 1:
         return seed_on(road_number(seed, roads), roads, seed_of_map(*road_of(name, seed)))
     if not is_map_file(name):
@@ -124,7 +124,7 @@ def file_of(name: str, seed: int) -> str:
 def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
     """The map of a file with a seed; episodes begin in the regions of the seed's part, if the file is alone.
 
-    On a map so small that a part would have no region, they begin anywhere in all parts.
+    On a map so small that a part would have no region, they begin anywhere, for all parts.
     """
     regions = _regions(road_map) if alone else None
     if regions is None:
@@ -136,7 +136,7 @@ def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
 
 
 def _regions(road_map: Map) -> np.ndarray | None:
-    """The part of each step of a lane, or else of each start, int [n]; None if a part has none."""
+    """The part that each step of a lane, or without lanes each start, belongs to: int [n]; None if a part has none."""
     places = road_map.starts[:, :2]
     if len(road_map.network.steps):
         points = road_map.network.points

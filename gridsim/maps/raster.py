@@ -1,6 +1,6 @@
 """Maps from pictures: the signed clearance of the road, and poses where a car can start.
 
-All lengths are in units (`SimConfig.unit`), which are metres but for small cars: `files` converts them.
+All lengths are in units (`SimConfig.unit`), which are metres except for small cars: `files` converts them.
 """
 
 from __future__ import annotations
@@ -171,8 +171,8 @@ def find_starts(
 
     Args: the field, a car in units of `unit` m, and whether the road has surroundings that are drawn like road.
     Returns: the field with walls where it is closed; start poses float64 [n, 3] (x, y, heading) along the road, both
-    ways, with a margin around a car that can drive on; the share of dead ends in the road.
-    Raises: ValueError if there are none.
+    ways, where a car has a margin around it and can drive on; the share of the road that is closed as dead ends.
+    Raises: ValueError if there are no such poses.
     """
     index, corner = _window(nodes)
     within = nodes[index]

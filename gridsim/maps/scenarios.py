@@ -52,7 +52,7 @@ REGISTRY: dict[str, Scenario] = dict(
 
 
 def full_name(name: str) -> str:
-    """A scenario's name that means the same in another folder: paths are absolute, and `all` is the registry."""
+    """A scenario's name that means the same in another folder: paths are absolute, and `all` is spelt out."""
     roads = [road for each in roads_of(name) for road in (REGISTRY if each == ALL else [each])]
     return ",".join(os.path.abspath(road) if is_map_file(road) else road for road in roads)
 
@@ -81,7 +81,7 @@ def check_name(name: str) -> None:
 
 
 def label(name: str) -> str:
-    """A short name of a scenario: for a file, its name without what says its format."""
+    """A short name of a scenario; for a file, its name without folder, format and crop."""
     if len(roads := roads_of(name)) > 1:
         every = {*REGISTRY} <= {*roads}
         return "+".join([ALL] * every + [label(road) for road in roads if not (every and road in REGISTRY)])
@@ -103,9 +103,10 @@ def map_digest(name: str) -> str:
 
 
 def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> int:
-    """The number of other cars on a road: a number that is asked for, `usual`, `heavy` or None, the default.
+    """The number of other cars on a road, if a number, `usual`, `heavy` or None (the default) is asked for.
 
-    Without a number there are none on a map without lanes, and for small cars. Raises: GridSimError for another word.
+    Unless it is a number, there are none on a map without lanes, or if cars are small. Raises: GridSimError for another
+    word.
     """
     if type(asked) is int:
         return asked
@@ -120,7 +121,7 @@ def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None
 
 
 def crowds(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> tuple[int, ...]:
-    """The number of other cars on each road of a scenario, as `traffic_on`; that of several is by default `usual`."""
+    """The number of other cars on each road of a scenario, as `traffic_on`; on several, the default is `usual`."""
     roads = roads_of(name)
     asked = "usual" if asked is None and len(roads) > 1 else asked
     return tuple(traffic_on(road, asked, config) for road in roads)
@@ -144,7 +145,7 @@ def _interval_of_files(name: str, _digest: str, config: SimConfig) -> tuple[floa
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    For a small car, a generated road is as much smaller as the car's unit (`SimConfig.unit`).
+    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`).
     """
     config = config or SimConfig()
     check_name(name)

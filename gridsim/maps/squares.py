@@ -67,7 +67,7 @@ class Layout:
         self.lines.append([x, y, end_x, end_y, self.half_road])
 
     def join(self, x: float, y: float, half: float, arms: list[int]) -> None:
-        """Add the roads that join the middles of some sides of a square (side 2 * half) centred on (x, y)."""
+        """Add roads that join the middles of the sides `arms` of a square (side 2 * half) centred on (x, y)."""
         if len(arms) == 3:
             # Adds no road, but fills the dip of the clearance where the other three strips meet.
             dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
@@ -89,7 +89,7 @@ class Layout:
         arms: list[int],
         pieces: Callable[[int, float, float], Pieces] = through_square,
     ) -> None:
-        """Add lanes from each of some sides of a square to each other; `pieces` is called like `through_square`."""
+        """Add lanes from each of the sides `arms` of a square to each other; `pieces` is like `through_square`."""
         for entry, exit in permutations(arms, 2):
             edge_x, edge_y = rotated(half, self.offset, entry)
             way = pieces((exit - entry) % 4, half, self.offset)

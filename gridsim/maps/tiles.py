@@ -49,7 +49,7 @@ def _neighbour(tile: int, direction: int) -> int:
 def tile_graph(rng: np.random.Generator) -> np.ndarray:
     """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends.
 
-    No straight road closes round the torus: a car that does not steer leaves it.
+    No straight road closes round the torus, so that a car that does not steer leaves the road.
     """
     while True:
         opened = [[False] * 4 for _ in range(TILES * TILES)]
