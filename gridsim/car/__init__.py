@@ -1,1 +1,1 @@
-"""The ego car: bicycle model, control step, end of an episode, reward."""
+"""The ego car: vehicle models, actions, reward."""

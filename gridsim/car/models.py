@@ -27,7 +27,7 @@ class Numbers(single_track.Numbers):
 
 
 def _by_model(name: str) -> Any:
-    """A function for kernels: that of the model whose parameters its first argument is."""
+    """The function `name` for kernels: it calls that of the model whose `Parameters` the first argument is."""
     functions = {model.Parameters: getattr(model, name) for model in MODELS.values()}
 
     def function(model, *rest):

@@ -29,7 +29,7 @@ LONGEST_STEP = F(0.0125)  # s that one step of the integration takes, at most
 
 @dataclass(frozen=True)
 class Numbers:
-    """The vehicle's numbers that only such models read: those of CommonRoad's vehicle 2, a BMW 320i."""
+    """The vehicle's numbers that only this model reads; by default, those of CommonRoad's vehicle 2, a BMW 320i."""
 
     mass: float = quantity(1093.3, 0.1, 1e5, "kg")
     yaw_inertia: float = quantity(1791.6, 1e-4, 1e7, "kg m2")
@@ -55,9 +55,9 @@ def parameters(vehicle: Any) -> Parameters:
 
 @leaf
 def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
-    """Move for dt seconds, in which the speed does not change its sign. Yaw rate and slip angle are fields of the car.
+    """Move for dt seconds. Yaw rate and slip angle are fields of the car, which this updates.
 
-    The implicit midpoint rule, which is stable however stiff the tyres are at low speed.
+    It integrates by the implicit midpoint rule, which is stable however stiff the tyres are at low speed.
     """
     after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
     acceleration = (after - speed) / dt
@@ -78,7 +78,7 @@ def move(model, constants, car, curvature, x, y, cosine, sine, speed, accelerati
             slip_after = math.atan(tangent)
             rate_after = middle * math.sin(slip_after) / rear
         else:
-            # (1 - h/2 A) z = z0 + h/2 c for z = (yaw rate, slip) in the middle of the step; twice z less z0 is its end.
+            # (1 - h/2 A) z = z0 + h/2 c for z = (yaw rate, slip) in the middle of the step; 2 z - z0 is its end.
             half = HALF * h
             a, b = ONE + half * moment * damping / middle, -half * moment * turning
             c = half * (ONE - turning / (base * middle * middle))

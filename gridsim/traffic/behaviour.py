@@ -58,8 +58,8 @@ def drivers(sim: SimConfig) -> Drivers:
 def idm(drivers, speed, desired, gap, leader):
     """Acceleration (m/s2) of the intelligent driver model: Treiber et al. 2000, equations 2 and 3.
 
-    Args: own speed and desired speed, m/s; gap to the leader's rear, m; the leader's speed, m/s. Without a leader, pass
-    a gap of 1e9.
+    Args: own `speed` and `desired` speed, m/s; `gap` to the leader's rear, m, or 1e9 without a leader; `leader`, the
+    leader's speed, m/s.
     """
     ratio = speed / max(desired, F(0.1))
     free = ratio * ratio
@@ -106,11 +106,11 @@ def _swerve(drivers, speed, shift, sway, place, way):
 
 @leaf
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
-    """Distance (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
+    """Distance (m) along a car's path to where another car, at (x, y), blocks it; 1e9 if it does not.
 
-    Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's place to `furthest`
-    m to its side of the road, or as far as there is room; on a road with several lanes there is none: it returns to the
-    lane.
+    Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's SHIFT to `furthest`
+    m towards its side of the road, or as far as `Network.room` allows. That is 0 on roads with several lanes: there the
+    path returns to its lane.
     """
     shift, sway = car[s.SHIFT], car[s.SWAY]
     aside_by = furthest > ZERO or shift != ZERO
@@ -167,7 +167,7 @@ def update_gap(network, drivers, car, other, is_ego):
     if not is_ego:
         lane = U(I(other[s.LANE]))
         at = _ahead(network, car, other) - drivers.half_length
-        # Nor is a car in another lane, if neither changes lanes.
+        # On a road with several lanes, a car in another lane is no obstacle either, if neither changes lanes.
         keep = other[s.SHIFT] == ZERO and car[s.SHIFT] == ZERO
         done = done or at < F(1e8) or (keep and max(network.left[lane], network.right[lane]) >= 0)
     aside = max(-to_side(network, car[s.SHIFT]), ZERO)
@@ -242,7 +242,7 @@ def change_lanes(network, drivers, world, i, ego):
 
 @leaf
 def _way_ahead(network, car, lane, along, there, place):
-    """Distance (m) forwards from `along` m on a lane to `place` m on another; 1e9 above LANE_CHANGE_SIGHT.
+    """Distance (m) forwards from `along` m on `lane` to `place` m on lane `there`; 1e9 above LANE_CHANGE_SIGHT.
 
     The way is the car's own as far as it is known, then along first successors.
     """
@@ -258,7 +258,7 @@ def _way_ahead(network, car, lane, along, there, place):
 
 @leaf
 def _way_between(network, car, lane, along, other):
-    """Distance (m) from a car's place on a lane to another car, negative if that is behind; else 1e9."""
+    """Distance (m) from `along` m on a lane to another car, negative if that is behind; 1e9 if it is neither."""
     there, place = I(other[s.LANE]), other[s.ALONG]
     ahead = _way_ahead(network, car, lane, along, there, place)
     behind = _way_ahead(network, other, there, place, lane, along)
@@ -267,7 +267,7 @@ def _way_between(network, car, lane, along, other):
 
 @leaf
 def _lanes_apart(network, lane, along, target):
-    """Distance (m) between a lane and its neighbour."""
+    """Distance (m) between a lane, at `along` m, and its neighbour `target`."""
     k = I(along / network.steps[lane])
     one, other = network.offsets[lane] + k, network.offsets[target] + k
     dx = wrapped_any(network.points[other, 0] - network.points[one, 0], network.width)
@@ -291,7 +291,10 @@ def _skew(network, lane, along, target):
 
 @njit(_nrt=False)
 def _choose_neighbour(network, drivers, world, i, ego):
-    """MOBIL (Kesting et al. 2007, equations 1 and 2). Not inlined: calls are expensive but rare."""
+    """Move car i to the lane that MOBIL prefers, if any (Kesting et al. 2007, equations 1 and 2).
+
+    Not inlined: calls are expensive but rare.
+    """
     car = world[i]
     lane = I(car[s.LANE])
     own_length = F(2.0) * drivers.half_length
@@ -323,7 +326,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 behind = -_way_between(network, car, lane, car[s.ALONG], other)
                 changes = ahead > F(1e8) and behind < F(-1e8) and other[s.SHIFT] != ZERO
                 if changes and dx * dx + dy * dy < config.LANE_CHANGE_ALONE * config.LANE_CHANGE_ALONE:
-                    free = False  # another car is changing lanes, to or from the target lane
+                    free = False  # a car on a third lane is changing lanes close by, perhaps from the target lane
                 wish = _desired(network, other)
             else:
                 forward = dx * car[s.COS] + dy * car[s.SIN]  # the ego car is on no lane
@@ -385,7 +388,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
 
 @leaf
 def _move(network, drivers, car, ego):
-    """Move one car for a control period along its lane, and sideways: to the right for the ego car, or back."""
+    """Move one car for a control period along its lane, and sideways: aside for the ego car, or back to its lane."""
     before, after = car[s.SPEED], max(car[s.SPEED] + car[s.ACCELERATION] * drivers.dt, ZERO)
     car[s.ALONG] += HALF * (before + after) * drivers.dt
     car[s.SPEED] = after

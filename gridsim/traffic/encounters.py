@@ -15,7 +15,7 @@ from gridsim.traffic.world import lane_after
 
 @leaf
 def meets_ego(network, drivers, car, ego):
-    """Whether to keep right for the ego car: it is near, a length behind at most, and oncoming or crossing.
+    """Whether a car keeps right for the ego car, which must be near, at most a length behind, and oncoming or crossing.
 
     A car that has already moved to the right stays there until the ego car has passed.
     """

@@ -16,7 +16,7 @@ from gridsim.maps.network import ALWAYS, MOVING, is_junction, lane_length, wrapp
 
 @leaf
 def _blocked_by_waiting_car(network, drivers, lane, other):
-    """Whether the rear of a car that waits at the end of `other` blocks a lane with the same beginning."""
+    """Whether a car that waits at the end of lane `other` blocks, with its rear, a lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - I((F(2.0) * drivers.half_length + drivers.jam) / step)
     q = max(q, network.offsets[other])
@@ -45,7 +45,7 @@ def _way_to_point(network, lane, x, y, within):
 
 @leaf
 def _in_ego_path(network, lane, ego, way):
-    """Whether a lane passes through the sector `way` m ahead of the ego car, or close to the ego car."""
+    """Whether a lane passes through the sector that reaches `way` m ahead of the ego car, or close to that car."""
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
         dx = wrapped_any(network.points[p, 0] - ego[s.X], network.width)
         dy = wrapped_any(network.points[p, 1] - ego[s.Y], network.height)
@@ -61,7 +61,10 @@ def _in_ego_path(network, lane, ego, way):
 
 @leaf
 def _must_yield(network, drivers, car, other, first, last, seconds):
-    """Whether a car has to give way to another that comes to a lane with priority over its next lane."""
+    """Whether a car has to give way to another that comes to a lane with priority over its next lane.
+
+    `first` to `last` are the crossings of this next lane; `seconds` on the lights' clock.
+    """
     onward, speed = I(other[s.NEXT]), other[s.SPEED]
     if not is_junction(network, onward):
         return False
@@ -94,12 +97,14 @@ def _has_no_room(drivers, world, car):
 def may_enter(network, drivers, world, i, ego, ego_way, seconds):
     """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond.
 
-    The ego car has the right of way for `ego_way` m at most, up to a red light; `seconds` on the lights' clock.
+    The ego car has the right of way on the ground ahead of it, up to `ego_way` m, where a red light stops it; `seconds`
+    on the lights' clock.
     """
     car = world[i]
     here, lane, beyond = I(car[s.LANE]), I(car[s.NEXT]), I(car[s.SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
-    # Enter only if the exit has room, for one car if it is itself a junction, or junctions would block each other.
+    # Enter only if there is room beyond the junction: otherwise, junctions block each other. If the lane beyond is in a
+    # junction, too, room for one car is enough.
     chained = is_junction(network, beyond)
     place = F(2.0) * drivers.half_length + drivers.jam
     room, needed = max(lane_length(network, beyond), place), place
@@ -150,8 +155,9 @@ def may_enter(network, drivers, world, i, ego, ego_way, seconds):
             onward == beyond and is_junction(network, there)
         ):
             needed += place
-    # The ego car goes first, unless it is behind this car. Its turn is unknown, so all the ground ahead of it is kept
-    # free. A car that is already in a junction, as in a roundabout, drives on.
+    # The ego car goes first, unless it is behind this car. Nobody knows which way it will turn, so all the ground ahead
+    # of it is kept free. A car that is already in a junction, as in a roundabout, does not wait for that: it only needs
+    # room beyond.
     dx, dy = ego[s.X] - car[s.X], ego[s.Y] - car[s.Y]
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[s.COS] + dy * car[s.SIN], dy * car[s.COS] - dx * car[s.SIN]

@@ -80,7 +80,10 @@ def choose_lane(network, lane, car):
 
 @njit(nogil=True)
 def _spawn(network, mileage, first, start, key, gap, ego_gap, lane_change_steps, world):
-    """Spawn an empty world's cars, uniformly over the lanes from `first` m on, apart from each other and the ego."""
+    """Spawn the cars of an empty world, `gap` m apart or more, and `ego_gap` m from the ego car.
+
+    `mileage` [lanes + 1]: cumulative m of lanes on which they may begin; each lane's part begins at `first` [lanes] m.
+    """
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
@@ -118,7 +121,7 @@ def lane_change_steps(config: SimConfig) -> int:
 
 
 def check_traffic(cars: int, config: SimConfig) -> None:
-    """Raises: GridSimError if so many other cars cannot drive, because they are too small for what traffic assumes."""
+    """Raises: GridSimError if there are other cars, but cars are too small for the lengths that traffic assumes."""
     if cars and config.unit < 1.0:
         raise GridSimError(f"traffic is for cars of 2.9 m or more, not of {config.vehicle.length:g} m: use traffic 0")
 
