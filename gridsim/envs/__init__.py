@@ -1,1 +1,1 @@
-"""Batches of cars, and the Gymnasium environments."""
+"""The environments of Gymnasium and Stable-Baselines3."""

@@ -66,8 +66,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     drive. `SAME_STEP`: at once; info has the last observations as `final_obs`, an array of objects, and the last info
     as `final_info`. `DISABLED`: the caller resets cars that have ended, by `reset(options={"reset_mask": mask})`.
 
-    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of a
-    `state.End`, arrays [n], which says what terminates and what truncates.
+    info, arrays [n]: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number
+    of a `state.End`, whose docstring says which ends terminate and which truncate.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
@@ -97,7 +97,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
         Args:
-            scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
+            scenario: a scenario's name, a map's file (which is one map), or several of these, separated by commas.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first map; the others' seeds follow.
             traffic: other cars in each car's world: usual, heavy, a number, or one for each of several roads; None
@@ -108,7 +108,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
             config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
-            features: which of `motion`, `steering`, `route` and `limit` rays come with.
+            features: which optional features (`gridsim.sensing.observation.OPTIONAL`) are observed besides the rays,
+                each True or False, such as motion=True.
         """
         check_name(scenario := full_name(scenario))
         for name, value, known in (
@@ -159,8 +160,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         Args:
             seed: car i is seeded with seed + i, or with seed[i]; without a seed a car goes on to its next episode.
             options: `map_seed`, one for all cars or one each: the map of these episodes; `start`, [5] or [n, 5]: x, y
-                (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars, once all have
-                been reset. Later episodes are drawn as usual.
+                (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars to reset,
+                given only after a first reset of all. Later episodes are drawn as usual.
         Returns: (observations of all cars, info, whose masks say which cars were reset).
         """
         known, options = ("map_seed", "start", "reset_mask"), options or {}
@@ -260,7 +261,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Record what cars `which` sense now, and the places of all for pictures; update the window; begun bool [n]."""
+        """Record what cars `which` sense, and all places for pictures; update the window; `begun` [n]: new episode."""
         self._observer.take(begun[which], which)
         if self.render_mode is None:
             return

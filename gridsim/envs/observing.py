@@ -40,7 +40,7 @@ class Observer:
             self.space = Dict({"grid": image, "speed": Box(low[-1:], np.ones(1, dtype=np.float32))})
 
     def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
-        """Add the newest frames of cars `which` [k], as all frames of those that have `begun` [k]."""
+        """Add the newest frame of each of cars `which` [k]; if its episode has `begun` [k], it becomes all frames."""
         if self._observation == "rays" or self._stack.shape[1] == 1:
             return
         stack, newest = self._stack[which], self._grids(which)

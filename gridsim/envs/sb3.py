@@ -25,7 +25,7 @@ class SB3VecEnv(VecEnv):
         self.cars: Any = gymnasium.make_vec(id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **options)
         self.render_mode = self.cars.render_mode
         super().__init__(num_envs, self.cars.single_observation_space, self.cars.single_action_space)
-        self.metadata = self.cars.metadata  # SB3's has no pictures a second, and its films would then have 30
+        self.metadata = self.cars.metadata  # SB3's own lacks the frame rate, and its films would then have 30
 
     def reset(self) -> Any:
         """Begin an episode of each car, with the seeds and options set since the last reset. Returns: observations."""

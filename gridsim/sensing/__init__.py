@@ -1,1 +1,1 @@
-"""Sensors: range rays, other cars as boxes, the occupancy grid."""
+"""What a car senses: range rays, the occupancy grid, a route; what sensors lack; an observation's features."""

@@ -52,7 +52,7 @@ def imperfections_of(config: SimConfig) -> tuple[Imperfections | None, Delays | 
 
 @leaf
 def degrade(imperfections, reach, car, ranges):
-    """Add noise to ranges (m) within the sensor's reach, and drop some of them."""
+    """Add noise to ranges (m), which stay within [0, `reach`], and set some to `reach`: they are dropped."""
     if imperfections is None:
         return
     place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre

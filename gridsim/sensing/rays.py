@@ -5,8 +5,8 @@ A ray is marched through the signed clearance field d to its root. It takes step
 road is wide, and Newton steps near the edge, with slopes of the bilinear field.
 
 A step longer than the clearance may skip a wall. On maps with walls thinner than such a step, steps are shorter, and
-checked: one from t0 to t1 is safe up to t0 + d(t0) and from t1 - |d(t1)| on. If the gap in between is about as long as
-the map's walls are thick, the ray goes back.
+checked: one from t0 to t1 is safe up to t0 + d(t0) and from t1 - |d(t1)| on. If a wall of the map may fit into the gap
+in between, the ray goes back.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
 
 @leaf
 def cast_lines(network, fan, reach, seconds, x, y, cosine, sine, ranges, closing):
-    """Shorten ranges (m) to stop lines whose light is not green, for rays that go over them the way traffic does.
+    """Shorten ranges (m) to stop lines whose light is not green, for rays that cross them in the direction of traffic.
 
     Args as in `cast_boxes`; `seconds` on the lights' clock. The closing speed of such a ray is 0.
     """

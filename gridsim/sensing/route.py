@@ -137,7 +137,7 @@ def follow_route(network, car, most):
 
 @exact
 def read(simulation, car, values):
-    """Write where the points of AHEAD are to values float32 [8]: how far ahead of the car, then how far to the left.
+    """Write to `values` float32 [8] where the points of AHEAD are: how far ahead of the car, then how far to the left.
 
     Both are shares of the points' distances along the route.
     """

@@ -33,9 +33,9 @@ def vector_march(steps: int, look_back: bool) -> Any:
 
     Its arguments: packed field with its sides; origin in cells; reach; the heading as cosine and sine; fan of
     `rays.fan` and the index of the first ray to march; the leap; ranges float32 [rays], written from that ray on, in
-    [0, reach]; lengths in units. It runs until the last ray has arrived. With `look_back`, a ray goes back to see the
-    blind part of a step that is longer than the leap; without, no code for that is emitted, and walls thinner than 3
-    may be passed.
+    [0, reach]; lengths in units. It runs until the last ray has arrived. With `look_back`, a ray goes back if the
+    part of a step that it did not see is longer than the leap; without, no code for that is emitted, and walls thinner
+    than 3 may be passed.
     """
 
     @intrinsic
@@ -97,7 +97,7 @@ def vector_march(steps: int, look_back: bool) -> Any:
             sx, sy = mul(dx, const(CELLS_PER_UNIT)), mul(dy, const(CELLS_PER_UNIT))
 
             def look(t: ir.Value | None) -> tuple[ir.Value, ir.Value]:
-                """Clearances and next steps (m) at ranges `t`, or at the origin, where all rays read the same word."""
+                """Clearances and next steps (units) at ranges `t`, or at the origin, where rays read the same word."""
                 px, py = (x0, y0) if t is None else (add(x0, mul(t, sx)), add(y0, mul(t, sy)))
                 fx, fy = builder.call(floor_of, [px]), builder.call(floor_of, [py])
                 ux, uy = sub(px, fx), sub(py, fy)

@@ -210,7 +210,7 @@ def drive(
     """
     simulator = manual(renderer.config, traffic)
     period = renderer.config.episode.control_period
-    pictures = max(round(period * FPS), 1)  # a control step
+    pictures = max(round(period * FPS), 1)  # per control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
     _begin(simulator, road_map, start, 0)

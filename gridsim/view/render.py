@@ -28,8 +28,8 @@ from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
-METRES = 52.0  # height of a picture. Lengths in this file are units (`SimConfig.unit`): metres, but for small cars
-CAR_AT = 0.74  # height of the car in a picture, as a share from the top
+METRES = 52.0  # height of a picture. Lengths here are in units (`SimConfig.unit`): metres, except for small cars
+CAR_AT = 0.74  # where the car is in a picture, as a share of the picture's height from the top
 
 
 class NoDisplayError(GridSimError):
@@ -135,9 +135,9 @@ class Renderer:
         opacity: float,
         least: float = 0.5,
     ) -> np.ndarray:
-        """Shapes [n, 11] at pixels `centre` [n, 2] with directions [n, 2] in the picture; half length and width in m.
+        """Shapes [n, 11] at pixels `centre` [n, 2] with directions [n, 2] there; half lengths and half width in units.
 
-        Shapes with a half width below `least` pixels are drawn that wide, and fainter.
+        Where half the width is below `least` pixels, it is drawn as `least`, and the shape fainter.
         """
         scale = self.pixels_per_m
         shapes = np.empty((len(centre), paint.SHAPE), dtype=np.float32)
