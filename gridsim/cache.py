@@ -25,9 +25,9 @@ _REMEDY = f"set {VARIABLE} to a folder that only you can write to"
 def cache_folder(name: str) -> Path:
     """Folder `name` of compiled kernels, made if missing.
 
-    It is in `GRIDSIM_CACHE_DIR`, `XDG_CACHE_HOME` or `~/.cache`; else in the temporary folder; else, with a warning, in
-    a new folder for this process and its children, which is removed when the process ends.
-    Raises: GridSimError if there is none that only the user can write to.
+    It is in the first of these that only the user can write to: what `GRIDSIM_CACHE_DIR` or `XDG_CACHE_HOME` names, or
+    else `~/.cache`; the temporary folder; a new folder for this process and its children, removed when the process
+    ends. Warns of the last one, and if the folder that a variable names is not used. Raises: GridSimError without any.
     """
     named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     problems: list[str] = []

@@ -20,14 +20,14 @@ _OUTLINE = np.array(
 _OUTLINE.setflags(write=False)
 _OUTLINE_STEP = F(
     0.1
-)  # m between points of the outline beside thin walls, at least; a corner may reach in by half of it
+)  # m between points of the outline beside thin walls, at least; a wall's corner may reach in by half of it
 
 
 @leaf
 def _outline_leaves_road(road, length, width, x, y, cosine, sine):
     """Whether a rectangle's outline leaves the road; length and width are halves (m).
 
-    Each side is walked by the clearance, as rays are: no corner of a parked car fits between two points.
+    It goes along each side in steps as long as the clearance, as rays do, so that it misses no corner of a parked car.
     """
     for _ in range(4):  # the right side from rear to front, then the others counter-clockwise
         x0, y0 = x - length * cosine + width * sine, y - length * sine - width * cosine
@@ -43,9 +43,10 @@ def _outline_leaves_road(road, length, width, x, y, cosine, sine):
 
 @leaf
 def collides(road, constants, x, y, cosine, sine):
-    """Whether any part of the car's outline is off the road: exact beside thin walls up to the clearance's 0.5 m grid.
+    """Whether any part of the car's outline is off the road.
 
-    Thick walls have no corners as sharp as those of parked cars; there, twelve points do.
+    On maps with thin walls, it is exact up to the clearance's grid of 0.5 m. On others, no wall has corners as sharp as
+    a parked car's, and it is enough to check twelve points.
     """
     length, width = constants.half_length, constants.half_width
     # Two circles cover the car, one each half. If both are clear of the edge, the outline need not be checked.
@@ -71,7 +72,7 @@ def separation(constants, dx, dy, cosine, sine, other_cosine, other_sine):
     """Gap (m) between two cars, the other (dx, dy) m away; negative if they overlap.
 
     It is the largest gap along any of their four axes (separating axis theorem, Gottschalk et al. 1996). If two corners
-    are closest, their distance is greater.
+    are closest, the cars are farther apart than that.
     """
     length, breadth = constants.half_length, constants.half_width
     along = abs(cosine * other_cosine + sine * other_sine)
@@ -90,7 +91,7 @@ def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 @leaf
 def top_speed_near(world, reach, width, height, x, y):
-    """Top speed (m/s) of the boxes whose middles are within `reach` m of a point; -1 if there are none."""
+    """Top speed (m/s) of a world's cars whose middles are within `reach` m of a point; -1 if there are none."""
     fastest = -ONE
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO:
@@ -102,7 +103,7 @@ def top_speed_near(world, reach, width, height, x, y):
 
 @leaf
 def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
-    """Whether a car overlaps a box of a world, moved back by `back` (a share) of a control period."""
+    """Whether a car overlaps a car of a world at the place where that was `back` (a share) of a control period ago."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO:
             behind = back * dt * world[j, SPEED]
@@ -117,7 +118,7 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
 
 @leaf
 def stands_ahead(constants, world, width, height, x, y, cosine, sine):
-    """Whether a standing box blocks the way close ahead of a car's front."""
+    """Whether a standing car of a world blocks the way close ahead of a car's front."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO and world[j, SPEED] < HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)

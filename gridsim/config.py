@@ -22,29 +22,30 @@ from gridsim.state import POSE
 _F = np.float32
 
 FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; see `SimConfig.file_speeds`
-# In units (`SimConfig.unit`), which are metres but for small cars.
-SUBSTEP = _F(1.0)  # a car moves between collision checks, at most
+# In units (`SimConfig.unit`), which are metres except for small cars.
+SUBSTEP = _F(1.0)  # most that a car moves between two collision checks
 REENTRY = _F(12.0)  # a car that returns to a cell within this distance driven is still on the same visit
 
 # Lanes. Own choices, unless a source is named.
 CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
 
 # Traffic, besides `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
-TRAFFIC_PACE = 0.5  # traffic's speed on a straight / (lower + upper end of the speed interval): its middle
+TRAFFIC_PACE = 0.5  # traffic's speed on a straight / (lower + upper end of the speed interval); 0.5 is the middle
 SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed = lane's speed * (0.9 to 1.2, uniform)
 SPAWN_SPEED = _F(0.5)  # share of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = 1.0  # s between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
-NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance: tolerance, as the ego car's lane is judged along a straight line
-# A car looks ahead the jam distance, LOOK_AHEAD m, the distance driven in LOOK_AHEAD_TIME s, and that of braking.
+# m per m2 of distance: the ego car's lane is judged along a straight line, with this tolerance for bends
+NEIGHBOUR_WIDENING = _F(0.004)
+# A car looks ahead by the jam distance + LOOK_AHEAD m + its way in LOOK_AHEAD_TIME s + its braking distance.
 LOOK_AHEAD, LOOK_AHEAD_TIME = _F(8.0), _F(1.5)
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 STOP_LINE_GAP = _F(0.25)  # m between a waiting car and the stop line; small, so that its rear clears a junction behind
-SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sideways; bends are as tight
+SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sideways, as in the curved road's bends
 STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
 LANE_CHANGE_ALONE = _F(20.0)  # m within which only one car at a time changes to or from a lane
 KEEP_LANE = _F(30.0)  # m before a junction, or where lanes part, within which cars stay in their lane
-SKEW = _F(0.05)  # m up to which a point of a lane is beside the one with the same index on its neighbour
+SKEW = _F(0.05)  # m; neighbours' points with the same index count as side by side if neither is farther ahead than this
 WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
 JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a crossing before the other lane is free
 
@@ -59,11 +60,11 @@ EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predict
 STANDING = _F(0.1)  # m/s below which a car stands
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
-PRIORITY_TIME = _F(4.0)  # s after a car that gives way enters a junction, within which no car with priority comes
+PRIORITY_TIME = _F(4.0)  # s; a car gives way to cars with priority that would arrive less than this after its entry
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
 EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
-EGO_SECTOR_COSINE = _F(0.6)  # the ego car may soon be within this angle (as a cosine) of its heading
+EGO_SECTOR_COSINE = _F(0.6)  # cosine of the angle to its heading within which the ego car may soon be
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class _Vehicle:
     reverse_limit: float = quantity(3.0, 0.0, 50.0, "m/s")  # backward
     acceleration: float = quantity(3.0, 0.1, 50.0, "m/s2")  # forward and in reverse
     braking: float = quantity(8.0, 0.1, 50.0, "m/s2")
-    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking it is 9.4:
-    # less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
+    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. Together with full braking, a
+    # car has 9.4: less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
     lateral_grip: float = quantity(4.9, 0.1, math.inf, "m/s2")
     model: str = "kinematic"  # of `car.models.MODELS`
     latency: float = quantity(0.0, 0.0, 2.0, "s")  # by which commands are late
@@ -146,7 +147,7 @@ class TrafficConfig:
     lights: bool = True  # whether there are traffic lights, where a file of a road has them
 
 
-MOST_STEPS = 65_535  # control steps of an episode
+MOST_STEPS = 65_535  # control steps of an episode, at most
 LENGTH = 4.0  # m, of a car whose unit is 1 m
 LEAST_UNIT = 1 / 16  # m
 
@@ -214,7 +215,7 @@ class SimConfig:
 
     @cached_property
     def unit(self) -> float:
-        """The unit in m: 1, and for cars shorter than 2.8 m 1/2, 1/4, 1/8 or 1/16.
+        """The unit in m: 1, or for cars shorter than 2.8 m one of 1/2, 1/4, 1/8 and 1/16.
 
         Generated roads, walls and the resolution of maps are sized in units. Speeds scale with the square root of the
         unit (Froude's law).

@@ -29,11 +29,11 @@ KERNEL_PACKAGES = ("gridsim", "evolution")
 
 
 def _sources() -> list[Path]:
-    """Folders of those packages. Ray unpacks each package into a folder of its own."""
+    """Folders of KERNEL_PACKAGES. Ray unpacks each package into a folder of its own."""
     own = Path(__file__).parent
     try:
         return [own, package_folder("evolution")]
-    except GridSimError:  # The simulator also works beside a user's file of that name, with the same kernels.
+    except GridSimError:  # `evolution` is missing, or a user's file hides it: the simulator still works.
         return [own, own.parent / "evolution"]
 
 

@@ -59,7 +59,7 @@ def number(value: Any, what: str, low: float, high: float, unit: str = "") -> fl
 
 
 def quantity(default: float, low: float, high: float, unit: str = "") -> Any:
-    """A dataclass's field for a number within limits; for a whole number, all three are int."""
+    """A dataclass's field for a number from `low` to `high`; if `default` and these are int, for a whole number."""
     return dataclasses.field(default=default, metadata={"limits": (low, high, unit)})
 
 

@@ -25,7 +25,7 @@ LATERAL = 3.2  # m/s2 in bends, below the grip limit
 ACCELERATION = 3.0  # m/s2
 BRAKING = 2.5  # m/s2 before bends
 WINDOW = 10.0  # units (`SimConfig.unit`) of a path over which curvature is averaged, as a driver's steering is jerky
-_STANDING = 1e-6  # m
+_STANDING = 1e-6  # m; a car that gets no farther in a control step stands
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:
@@ -36,7 +36,7 @@ def arc_length(points: np.ndarray) -> np.ndarray:
 def curvature_along(points: np.ndarray, arc: np.ndarray, window: float = WINDOW) -> np.ndarray:
     """Curvature (1/m) at points [n, 2] of a path, from the chords of `window` / 2 m before and after each.
 
-    Near the path's ends it is that of the nearest point with `window` / 4 m on either side.
+    Near the path's ends it is that of the nearest point with `window` / 4 m on either side. `arc`: their `arc_length`.
     """
 
     def point(s: np.ndarray) -> np.ndarray:
@@ -64,7 +64,8 @@ def profile(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Speed (m/s) and steering (rad, left positive) of the reference along a driven path: float64 [n] each.
 
-    Args: points [n, 2] in m, in order, all different, not wrapped over the torus; speed at the first point, m/s.
+    Args: `points` [n, 2] in m, in driving order, all different, not wrapped over the torus; `interval`, the scenario's
+    speed interval, and `start_speed`, at the first point, m/s; `window` as in `curvature_along`.
     """
     arc = arc_length(points)
     curvature = curvature_along(points, arc, window)
@@ -93,8 +94,8 @@ class Series(NamedTuple):
 def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     """The errors of several drives together, by name: means over the metres (trapezoidal rule) and maxima of |e|.
 
-    Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to the
-    steering limit to one side, since the reference's angle is 0 on a straight.
+    In percent, errors of velocity are relative to the reference's mean speed, since its speed at a place may be 0, and
+    errors of steering to the steering limit on one side, since the reference's angle is 0 on a straight.
     """
     parts = [part for part in parts if len(part.arc) > 1]
     metres = sum(float(part.arc[-1] - part.arc[0]) for part in parts)
@@ -123,8 +124,9 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
     Left out are reversing, metres that are driven again, and standing, where steering has no effect; the first 5 m,
     whose curvature is not known; and the last metres, where the reference might brake for what lies beyond.
 
-    The reference begins with the agent's speed and ignores traffic. Its curvature is that of the driven path over 10 m:
-    an agent that weaves in longer waves slows it down, so look at both errors.
+    The reference begins with the agent's speed and ignores traffic. It follows the driven path, whose curvature is
+    averaged over 10 m: if the agent weaves in longer waves, the reference drives them, too, and more slowly. So look at
+    both errors. Raises: ValueError if nothing was driven.
     """
     poses = np.asarray(poses, dtype=np.float64)
     steps = road_map.shortest(np.diff(poses[:, :2], axis=0))

@@ -19,7 +19,9 @@ from gridsim.sensing.route import check_lanes
 from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 
-MOST_MAPS = 256  # above that, maps without cars leave the atlas; a map takes some 2 MB, at most 8
+# Once the atlas has so many maps, adding one removes those without cars. A generated map takes some 2 MB, one from a
+# file up to 70 MB.
+MOST_MAPS = 256
 
 
 Physics = tuple[Atlas, tuple[Any, ...]]  # several maps, and the `step.parameters`
@@ -41,7 +43,7 @@ def _history_of(histories, i):
 
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, histories):
-    """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
+    """Put cars `which` [k] at `starts` [k, 5 or 8] and sense. Args as in `_control_all`; `order` indexes `which`."""
     ranges, closing, observations = seen
     for row, first, last in runs:
         simulation = _on_map(physics, row)
@@ -54,10 +56,11 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, 
 
 @njit(nogil=True)
 def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
-    """One control period of every car; one whose episode has ended stands still.
+    """One control period of every car; a car whose episode has ended stands still.
 
-    Args: cars `order` map by map; runs int64 [maps, 3], a map's row in the atlas and its cars' range in `order`; seen,
-    ranges and closing speeds [n, rays] and observations [n, values], and rewards [n], to be filled.
+    Args: `order` int64 [n], indices of cars, sorted by map; `runs` int64 [maps, 3], for each map its row in the atlas
+    and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
+    Writes: `rewards` [n]; `seen`: ranges and closing speeds [n, rays], observations [n, values].
     """
     ranges, closing, observations = seen
     for row, first, last in runs:
@@ -83,7 +86,7 @@ def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, vis
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cars sorted by their maps `rows` [n]: (order int64 [n], runs int64 [maps, 3]), as `_control_all` reads them."""
+    """Cars sorted by their maps' rows [n] in the atlas: (order int64 [n], runs int64 [maps, 3]) of `_control_all`."""
     order = np.argsort(rows, kind="stable")
     names, first = np.unique(rows[order], return_index=True)
     return order, np.stack([names, first, np.append(first[1:], len(rows))], axis=1).astype(np.int64)
@@ -92,14 +95,14 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class Simulator:
     """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
 
-    A car's behaviour depends only on its own map, start and actions. Attributes, which steps and resets change:
+    What a car does depends only on its own map, start, traffic and actions. Attributes, which steps and resets change:
         cars: float32 [n, CAR_FIELDS].
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
         closing: float32 [n, rays], m/s, the closing speeds that go with them; [n, 0] if the features lack `motion`.
-        observations: float32 [n, values], what networks see of that (`sensing.observation`).
+        observations: float32 [n, values], what networks see (`sensing.observation`).
     """
 
     def __init__(
@@ -111,9 +114,10 @@ class Simulator:
         traffic: int = 0,
         features: tuple[str, ...] = (),
     ):
-        """Make room for `cars` cars, each with a world of `traffic` other cars; observations have these features.
+        """Make room for `cars` cars, each with a world of `traffic` other cars.
 
-        `target` (m) and `max_steps` (control steps) are the configuration's unless given.
+        Observations have these `features` of `sensing.observation.OPTIONAL`. `target` (m) and `max_steps` (control
+        steps) are the configuration's unless given.
         """
         self.config = config or SimConfig()
         episode = self.config.episode
@@ -199,9 +203,9 @@ class Simulator:
         return self.cars, self.visits, worlds, seen, self._histories
 
     def _batches(self, cars: np.ndarray | None = None) -> Iterator[tuple[Physics, np.ndarray, np.ndarray]]:
-        """Cars [k], by default all, in batches with the same physics: that, `order` and `runs` as kernels read them.
+        """Split cars [k], by default all, into batches with the same physics; each randomised vehicle is a batch.
 
-        Randomised vehicles have a batch each.
+        Yields: (physics, `order`, `runs`), the last two as in `_control_all`.
         """
         if self._physics is None:
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
@@ -215,7 +219,7 @@ class Simulator:
             yield (self._physics[0], self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
-        """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
+        """Put cars [k] on maps [k]. Adds new maps to the atlas; if it has MOST_MAPS, maps without cars are removed."""
         for each in set(maps):
             check_lanes(each, self.features)
         self.maps.update(zip(cars.tolist(), maps, strict=True))

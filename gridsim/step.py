@@ -75,7 +75,7 @@ def parameters(config: SimConfig, features: tuple[str, ...] = ()) -> tuple[Any, 
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig, features: tuple[str, ...] = ()) -> list[Simulation]:
-    """A Simulation for each map, as `parameters`. Raises: GridSimError for a route without lanes."""
+    """A Simulation for each map. Raises: GridSimError if a route is to be followed on a map without lanes."""
     for each in road_maps:
         check_lanes(each, features)
     shared = parameters(config, features)
@@ -132,10 +132,10 @@ def start_from(car, start):
 
 @leaf
 def look(simulation, car, world, ranges, closing, observation, history):
-    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge, a car or a stop line.
+    """Sense ranges (m), from the middle of the front axle to the road's edge, a car or a stop line, and observe.
 
-    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], unless that is [0], as in
-    `rays.cast_boxes`; the observation float32 [values]. With a `history` ranges and closing speeds are as late as the
+    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], the closing speeds of `rays.cast_boxes`,
+    unless it is empty; observation float32 [values]. With a `history`, ranges and closing speeds come late, by the
     simulation's delays.
     """
     road, constants, fan = simulation.road, simulation.constants, simulation.fan
@@ -157,7 +157,8 @@ def look(simulation, car, world, ranges, closing, observation, history):
 def step(simulation, car, visits, world, acceleration, steering, target, max_steps):
     """One control step: advance in sub-steps with collision checks, count new ground, check for the end.
 
-    Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
+    Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits: `target`, m of new ground, and
+    `max_steps`, control steps.
     Returns: an End as a number.
     """
     road, constants = simulation.road, simulation.constants
