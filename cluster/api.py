@@ -74,7 +74,7 @@ def evolve(
         on_generation: called with the number of generations done and the latest one's figures.
         folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
         resume: go on with the run in `folder` if there is one.
-        address: of a Ray cluster, host:port or "auto", for `workers` of which 0 is as many as it has CPUs free.
+        address: a Ray cluster, host:port or "auto", to run the workers on; 0 workers are then one for each free CPU.
         tracking_uri: MLflow's address, to which a run with a folder is sent; None sends nothing.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
@@ -113,8 +113,8 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     Args:
         runs: their folders; a comparison's folder stands for all of its finished runs.
 
-    Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; an
-    error that could not be measured is nan.
+    Returns: a row for each run: run (its folder), scenario, learner, seed, traffic, and the figures as table.csv names
+    them; an error that could not be measured is nan.
     Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
     """
     from cluster.compare.plan import read_runs

@@ -27,7 +27,7 @@ MAX_EPISODES = 10_000
 
 
 class Evaluator:
-    """Drives networks on training roads, on all cores or by Ray workers: what a search of your own asks for.
+    """Drives networks on training roads, on all cores or by Ray workers, for a search of your own.
 
     >>> import gridsim, numpy as np
     >>> with gridsim.Evaluator("curved", policy="mlp:8", episodes=4) as evaluator:
@@ -52,12 +52,12 @@ class Evaluator:
 
         Args:
             scenario: a road's name, or a map file.
-            policy: the network, as for --policy of gridsim-evolve, whose default is this one's.
+            policy: the network, as for --policy of gridsim-evolve, with the same default.
             traffic: other cars, usual, heavy or a number; -1 is as many as the road has by default.
             sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these. A lower target
                 and time limit make an evaluation shorter.
             workers, address: Ray workers, and a cluster's address; by default this process's threads.
-            episodes: that each genome drives.
+            episodes: how many each genome drives.
             actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
 
         Raises: GridSimError, a ValueError, in one line.
@@ -107,7 +107,7 @@ class Evaluator:
         return fitness.scalar(self._drive(genomes, episodes), episodes.rows["target"].astype(np.float64))
 
     def champion(self, genome: np.ndarray, sim: SimConfig | None = None) -> Champion:
-        """A genome [genes] as a champion, to be saved, watched, evaluated on held-out roads; `sim` is ours if None."""
+        """A genome [genes] as a champion, to save, watch or evaluate on held-out roads; `sim` is by default ours."""
         s, genome = self._settings, self._checked(np.asarray(genome)[None])[0]
         return Champion(genome, str(self.spec), s.scenario, sim or self._sim, s.traffic)
 

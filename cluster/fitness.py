@@ -1,7 +1,7 @@
 """Fitness functions of the user's own: found by name, called, and their faults said in one line.
 
-A function is named `MODULE:FUNCTION` or `FILE.py:FUNCTION`, or is given in Python. Its code runs in the coordinator
-only, and only if the user names it in the command: a run's config.json holds its name and its source's digest.
+A function is named `MODULE:FUNCTION` or `FILE.py:FUNCTION`, or is given in Python. Its code runs in the run's own
+process, never in Ray's workers, and only if the user names it in the command: that config.json names it is not enough.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _given: dict[str, Fitness] = {}  # functions that were given as objects, by thei
 
 
 def give(function: Fitness) -> str:
-    """The name of a function that is given in Python, by which `load` finds it in this process."""
+    """Keep a function that is given in Python. Returns: the name by which `load` finds it in this process."""
     name = f"{getattr(function, '__module__', '?')}:{getattr(function, '__qualname__', type(function).__name__)}"
     forget()
     _given[name] = function
@@ -45,7 +45,7 @@ def forget() -> None:
 
 @cache
 def load(name: str) -> Fitness:
-    """The function of a name; it raises GridSimError where its own code fails. Raises: GridSimError."""
+    """The function of a name; if its own code fails or its scores do not fit, it raises GridSimError, as this does."""
     function = _given.get(name) or _find(name)
 
     def score(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
@@ -66,7 +66,7 @@ def load(name: str) -> Fitness:
 
 
 def digest(name: str) -> str:
-    """Digest of the source that a function comes from, of which nothing is run; "" if it cannot be found."""
+    """Digest of the source that a function comes from, without running any of it; "" if it cannot be found."""
     try:
         source = inspect.getsource(_given[name]).encode() if name in _given else _file(name).read_bytes()
     except (OSError, TypeError, ValueError):

@@ -12,20 +12,20 @@ _HARMLESS = (
     "unix_socket", "user",
 )  # fmt: skip
 """Parameters of a query that are shown; no list of the secret ones would be complete."""
-_SECRET = "pass|pw|token|secret|key|cred|sig|auth|odbc_connect"  # in names, as error texts have them
+_SECRET = "pass|pw|token|secret|key|cred|sig|auth|odbc_connect"  # parts of the names of secrets in error texts
 
 
 def redacted(uri: str) -> str:
     """An address without user and password, without a fragment, and with harmless query parameters alone.
 
-    A password may hold an @ or a slash, so that user and password end with the last @. An @ behind a question mark may
-    belong to a password as well as to a parameter: then the address is shown as its scheme and `UNCLEAR`.
+    A password may hold an @ or a slash, so everything up to the last @ is left out. An @ behind a question mark may
+    belong to a password or to a parameter: then the address is shown as its scheme and `UNCLEAR`.
     """
     start, rest = re.fullmatch(r"((?:[\w.+-]*:)?//|)(.*)", uri, re.DOTALL).groups()  # type: ignore[union-attr]
     head, mark, query = rest.partition("?")
     if "@" in query:
         return f"{start}{UNCLEAR}"
-    if not head.startswith("/"):  # no file's name
+    if not head.startswith("/"):  # the path of a file has no user, and may have an @
         head = head.rpartition("@")[2]
     if start.lower().startswith("http"):
         head = re.split("[#;]", head, maxsplit=1)[0]
@@ -37,7 +37,7 @@ def redacted(uri: str) -> str:
 def one_line(error: BaseException, uri: str = "") -> str:
     """An error in one line, without secrets; for errors of the system only the reason.
 
-    Args: `uri` is the address that was used, which the error's text may have as it was given.
+    Args: `uri` is the address that was used: the error's text may hold it, with its password.
     """
     text = str(error) or type(error).__name__
     if isinstance(error, GridSimError):

@@ -48,7 +48,7 @@ class Place:
 
     workers: int = 0  # Ray workers; 0: in this process, or on a cluster as many as it has free CPUs
     address: str | None = None  # of a Ray cluster, host:port
-    patience_s: float = 0.0  # without any worker, after which a run stops; 0: the usual
+    patience_s: float = 0.0  # time without any worker after which a run stops; 0: as by default (`open_pool`)
     uri: str = ""  # MLflow's; "": MLflow gets nothing
     experiment: str = ""
     wall_limit_s: float = math.inf  # wall-clock budget, including time before a resume; at least one step is done
@@ -159,7 +159,7 @@ class Session:
         return perf_counter() - self.started
 
     def learn(self) -> None:
-        """Learn to the end, saving once a second and at the end."""
+        """Learn to the end, saving steps once a second (the DQN's at once) and at the end."""
         learning = self.learning
         if math.isfinite(self.wall_limit_s):  # a limit is for learning alone, so that a slow start takes none of it
             self.started = perf_counter() - (learning.history[-1]["wall_s"] if learning.history else 0.0)

@@ -17,7 +17,7 @@ def cars(traffic: int | str) -> str:
 
 
 def km_per_collision(figures: Mapping[str, float]) -> str:
-    """Kilometres per collision of `figures.summarise`; without a collision, which distance was driven."""
+    """Kilometres per collision of `figures.summarise`; without a collision `more than` the kilometres driven."""
     km = figures["km_per_collision"]
     return ("" if figures["collision_rate"] else "more than ") + (f"{km:,.0f}" if km >= 100.0 else f"{km:.3g}")
 

@@ -35,8 +35,8 @@ T = TypeVar("T")
 FAILED, WRONG_USE = 1, 2  # exit codes
 MANY_WORKERS = 4  # per core; more cause a warning
 
-# tyro wraps a field's docstring as one paragraph only if its lines are not indented. It has no setting for this, and no
-# other part of a command reads docstrings.
+# tyro wraps a field's docstring as one paragraph only if its lines are not indented. It has no setting for this, so the
+# function that reads docstrings is replaced; no other part of a command uses it.
 _constant = attrdoc.ast_get_constant_value
 attrdoc.ast_get_constant_value = lambda node: (
     " ".join(value.split()) if isinstance(value := _constant(node), str) else value
@@ -230,7 +230,7 @@ def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], 
 
     Errors for the user are shown in one line, followed by the hint for their type, if any.
     """
-    for stream in (sys.stdout, sys.stderr):  # a path that the terminal's encoding lacks is no error
+    for stream in (sys.stdout, sys.stderr):  # characters that the terminal lacks are no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="surrogateescape" if stream.encoding.lower() == "utf-8" else "backslashreplace")
     try:

@@ -156,7 +156,7 @@ def _train(
     console: Console, left: Sequence[RunFolder], total: int, jobs: int, run_s: float,
     start: Callable[[RunFolder], Child],
 ) -> int:  # fmt: skip
-    """Train the runs that are left of all, so many at once, until a signal comes; a run that fails stops no other.
+    """Train the runs `left` of `total`, `jobs` at a time, until a signal comes; a run that fails stops no other.
 
     Args: `run_s` is how long a run may take, nan if that is unknown. Returns: how many failed.
     """

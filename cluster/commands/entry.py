@@ -31,7 +31,7 @@ def _enter(module: str, name: str) -> None:
         print(f"gridsim {version(DISTRIBUTION)}")
         return
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # else the shell or nohup had it ignored
+        if signal.getsignal(number) is not signal.SIG_IGN:  # one that the shell or nohup ignores stays ignored
             # Until a command has something to save (`stopping.listen`).
             signal.signal(number, lambda *_: stopping.end_at_once())
     _settle_environment()

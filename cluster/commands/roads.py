@@ -1,4 +1,4 @@
-"""gridsim-map: what was read of a file of roads, and a picture of it."""
+"""gridsim-map: what was read from a file of roads, and a picture of it."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _map() -> int:
 
 
 def _describe(name: str) -> None:
-    """Print what was read of a file."""
+    """Print what was read from a file."""
     config = SimConfig()
     here = build(name, 0, config)
     road, network = here.road, here.network

@@ -15,7 +15,7 @@ def driving_table(
     crowds: Sequence[int],
     target: float,
 ) -> Table:
-    """How well a champion drives where it never was, and a row for each of several roads, among so many other cars.
+    """How well a champion drives on held-out maps; of several roads a row for each, with its other cars (`crowds`).
 
     `target` m without a collision are success.
     """

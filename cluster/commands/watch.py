@@ -182,7 +182,7 @@ def _is_recording(source: str) -> bool:
 
 
 def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
-    """Yield drives and who drives: a recording's episodes, else a champion or an elite, in a window without end.
+    """Yield drives and who drives: a recording's episodes, else drives of a champion or elite, in a window without end.
 
     Raises: GridSimError.
     """

@@ -31,10 +31,10 @@ from gridsim.packages import DISTRIBUTION
 
 COMPARISON = "comparison.json"
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
-UNLIMITED = MAX_STEPS  # generations or car-steps of a run that its wall time ends
+UNLIMITED = MAX_STEPS  # generations or car-steps of a run that another limit ends
 CAR_STEPS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}  # car-steps of each unit of --budget
-SECONDS = {"s": 1, "min": 60, "h": 3600}  # the same for units of time
-EVALUATIONS = 10  # that the DQN makes within a budget of car-steps, at least
+SECONDS = {"s": 1, "min": 60, "h": 3600}  # seconds of each unit of --budget
+EVALUATIONS = 10  # least number of evaluations of the DQN within a budget of car-steps
 # Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
 PLANNED = (
     "scenario", "sim", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
@@ -83,7 +83,7 @@ class Plan:
         runs = dataclasses.replace(self, seeds=1).planned(Path())
         if len({run.name for run in runs}) != len(runs):
             raise GridSimError("two runs would have the same name: name all once, also in --grid, or rename a map")
-        # The DQN's settings hold neither --population nor --generations.
+        # Evolution's settings are checked anyway: the DQN's hold neither --population nor --generations.
         for settings in (self.settings(self.scenarios[0], "evolution", 0), *(run.settings for run in runs)):
             settings.check()
 
@@ -98,7 +98,7 @@ class Plan:
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
-        """The combinations of `grid` for a learner, by the settings' names. Raises GridSimError."""
+        """The combinations of `grid` for a learner, each as values by settings' names. Raises GridSimError."""
         usual = vars(self.settings(self.scenarios[0], learner, 0))
         choices: list[list[tuple[str, Any]]] = []
         for text in self.grid:

@@ -15,7 +15,7 @@ from pathlib import Path
 from cluster.store.folder import RunFolder
 from cluster.workers.child import Child
 
-LOGS = "logs"  # folder, in the comparison's, of the files with what the runs print
+LOGS = "logs"  # folder in the comparison's folder, for files with what the runs print
 
 
 def flags_of(run: RunFolder, **more: object) -> list[str]:
@@ -25,9 +25,9 @@ def flags_of(run: RunFolder, **more: object) -> list[str]:
 
 
 def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str, str]) -> Child:
-    """Start the process that trains a run, whether it was begun or not; what it prints is in its log.
+    """Start the process that trains a run, or continues it if it was begun; what it prints goes to its log.
 
-    Args: `flags` are the command's besides those of the run, and `environment` what its own has besides this one's.
+    Args: `flags`, the command's flags besides the run's settings; `environment`, variables besides this process's.
     """
     folders = Path(sys.argv[0]).parent, Path(sys.executable).parent  # this program's, and Python's
     script = shutil.which(run.settings.command, path=os.pathsep.join(map(str, folders))) or run.settings.command

@@ -58,7 +58,7 @@ def page(folder: Path, groups: Groups, plan: Plan | None, drawn: bytes) -> bytes
 
 
 def _table(lines: Sequence[Sequence[str]], runs: Sequence[Sequence[str]] = ()) -> str:
-    """A table as HTML; its first line is the header. With `runs`, these cells, as HTML, replace the seeds' column."""
+    """A table as HTML; its first line is the header. With `runs`, these cells, HTML already, replace a line's seeds."""
     rows = []
     for k, line in enumerate(lines):
         cells = [escape(cell) for cell in line]
@@ -75,7 +75,7 @@ def _link(folder: Path, run: Path) -> str:
 
 
 def read_comparison(folder: Path) -> Content:
-    """What MLflow gets of a comparison, from its folder: the plan, the files, and how many runs were done by when."""
+    """What MLflow gets of a comparison, from its folder: the plan, the files, and the number of runs done over time."""
     plan = read_plan(folder)
     planned = plan.planned(folder)
     done = [run.path for run in planned if has_summary(run)]

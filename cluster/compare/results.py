@@ -38,7 +38,7 @@ ERROR_FIGURES = {
     "steering_error_max_deg": "steering_max_deg",
     "compared_m": "metres",
 }
-"""A champion's errors against the reference, by their names in `gridsim.reference`."""
+"""A champion's errors against the reference driver: their names here, and those in `gridsim.reference`."""
 RUN_FIGURES = (
     "success_rate", "distance_m", "speed_mps", "collision_rate", "km_per_collision", "car_steps", "wall_s",
     "training_s", "best_car_steps", "best_wall_s",
@@ -88,7 +88,7 @@ def measured(run: Run) -> Run:
 
 
 def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: Traffic | None) -> list[Series]:
-    """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference`.
+    """Drives of a champion beside the reference driver, one for each episode, in order; see `gridsim.reference`.
 
     Episodes in which it does not drive a metre forward are left out.
 

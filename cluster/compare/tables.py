@@ -17,7 +17,7 @@ from cluster.text import cars, count
 from gridsim.maps.scenarios import Traffic, label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
-LIMITS = ("seed", "until", "generations", "car_steps", "episodes")  # settings in which variants do not differ
+LIMITS = ("seed", "until", "generations", "car_steps", "episodes")  # settings that may differ within a group
 Groups = dict[tuple[str, str], list[Run]]
 Columns = Mapping[str, tuple[str, float, int]]  # of each column: the figure, its unit's scale, decimal places
 DRIVING: Columns = {
@@ -42,10 +42,10 @@ FEW = 3  # seeds; fewer are too few for a verdict
 
 
 def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
-    """Runs by the names of their road and learner; with a plan, also its missing runs, which have no figures.
+    """Group runs by the names of their road and learner; with a plan, also its missing runs, which have no figures.
 
-    A road's name has the traffic if there are several amounts of it, a learner's the observation if there are both, and
-    the settings in which others of this learner on this road differ.
+    Names say only what is needed to tell groups apart. A road's has the traffic if this road has several amounts of it.
+    A learner's has the observation if there are both rays and grid, and settings that its runs on this road differ in.
     """
     if plan:
         made = {run.settings: run for run in runs}
@@ -69,7 +69,7 @@ def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
 
 
 def quartiles(runs: Sequence[Run], figure: str) -> tuple[list[float], tuple[float, float, float]]:
-    """The runs' finite values of a figure, and their quartiles; nan if there are none."""
+    """The runs' finite values of a figure, and (lower quartile, median, upper quartile), nan without a value."""
     values = [run.figures[figure] for run in runs if math.isfinite(run.figures.get(figure, math.nan))]
     lower, median, upper = np.quantile(values or [math.nan], [0.25, 0.5, 0.75]).tolist()
     return values, (lower, median, upper)

@@ -1,8 +1,8 @@
 """The DQN's loop: workers collect a batch of experience while the learner trains on the batches before.
 
-Batch k is collected with the weights after update block k - 2, the newest ones when it is sent out: block k - 1 is
-trained meanwhile, on the batches up to k - 1. So workers and learner do not wait for each other, and the network is the
-same for any number of workers. A step of the run is an evaluation: the averaged network drives the validation
+Each batch requires some updates. The learner makes them while the workers collect the next batch, with the weights from
+before these updates, or while they drive validation. So workers and learner do not wait for each other, and the network
+is the same for any number of workers. A step of the run is an evaluation: the averaged network drives the validation
 episodes, as evolution's candidates do.
 """
 
@@ -153,7 +153,7 @@ class Dqn(Learning):
     def _change_of_values(self, updates: int) -> float:
         """Change of the Q values of fixed observations since the last evaluation, as a share of their spread.
 
-        Values that change little count towards convergence if there were updates.
+        A small change counts towards convergence only if there were updates.
         Raises: FloatingPointError if weights or values are not finite.
         """
         if not len(self.probe):
@@ -186,7 +186,7 @@ class Dqn(Learning):
     def state(self) -> State:
         arrays, meta = super().state()
         arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
-        if not self.done() and not self.out_of_time():  # most of a checkpoint; a run that is extended fills a new one
+        if not self.done() and not self.out_of_time():  # large; an extended run fills a new one
             arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
         return arrays, meta

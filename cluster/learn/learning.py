@@ -1,7 +1,7 @@
 """What the two learners share: the champion and how it is found, its figures, the history, the state.
 
 All decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
-returned what. (A limit of wall time ends a run earlier; what it has found by then is still the seed's.)
+returned what. (A limit of wall time ends a run earlier; the steps that it has made follow from the seed all the same.)
 
 A step is a generator: it yields an `Event` each time it has to wait for the workers, so that its caller can save, show
 progress and stop there.
@@ -51,9 +51,9 @@ class Champion:
     """The best network found so far, and its figures in the validation episodes."""
 
     genome: np.ndarray  # float32 [genes]
-    score: float = 0.0  # of `Curriculum.validation_scores`, of several roads the success on the worst one
+    score: float = 0.0  # `Curriculum.validation_scores`; on several roads the success rate on the worst one
     success_rate: float = 0.0
-    # Between equal scores: mean distance (m), of several roads the mean score, or a fitness of the user's own.
+    # Decides between equal scores: mean distance (m); on several roads the mean score; or the user's own fitness.
     tie_break: float = 0.0
     step: int = -1  # in which it was found
 
@@ -116,11 +116,11 @@ class Learning(ABC):
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
     def choose_champion(self) -> Progress:
-        """Choose the champion of a run that ends: if it is unsolved, it or the last candidate, on maps of their own.
+        """Choose the champion when a run ends: if unsolved, the better of champion and last candidate on new maps.
 
-        A champion is the best of many on the same maps, so later candidates that drive better may not reach its score.
-        This is not in the checkpoint: a run that is extended goes on as if it had never ended. Its car-steps do not
-        count.
+        The champion's score was the best of many on the same maps, by luck as well, so a later candidate that drives
+        better may not have reached it. This choice is not in the checkpoint: a run that is extended goes on as if it
+        had never ended. Its car-steps do not count.
         """
         candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
         if candidate is None or self.solved or (before and np.array_equal(candidate, before.genome)):
@@ -144,9 +144,9 @@ class Learning(ABC):
             self.solved = bool(self.curriculum.validation_scores(results[0]).min() >= self.settings.until)
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
-        """What champions are compared by, from a candidate's validation, RESULT [1, episodes]; the first decides.
+        """Score and tie-break, by which champions are compared, of a candidate's validation, RESULT [1, episodes].
 
-        On several roads it is success on the worst one: speed on one must not outweigh collisions on others.
+        On several roads the score is success on the worst one: speed on one must not outweigh collisions on others.
         """
         scores = self.curriculum.validation_scores(results[0])
         if len(scores) == 1:
@@ -154,9 +154,9 @@ class Learning(ABC):
         return float(success_rate(results.reshape(len(scores), -1)).min()), float(scores.mean())
 
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
-        """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""
+        """Wait until a call that the pool has begun is done, and `train`, which is called meanwhile, returns False."""
         warned, busy = 0, True
-        yield Event(stage, *call.progress())  # first of all: what the caller saves must not have changed
+        yield Event(stage, *call.progress())  # before any training, which changes arrays that the caller may save now
         while self.pool.wait(call, 0.0 if busy else WAIT_S) or busy:
             busy = busy and train()
             for text in call.warnings[warned:]:
@@ -181,7 +181,7 @@ class Learning(ABC):
     def drive(
         self, stage: str, genomes: np.ndarray, episodes: Episodes, train: Callable[[], bool] = lambda: False
     ) -> Generator[Event, None, Outcome]:
-        """Results [n, e] of given genomes [n, genes], sent as plain copies."""
+        """Drive given genomes [n, genes], sent as plain copies. Returns: the call, with its results [n, e]."""
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
         return (yield from self._evaluate(stage, copies, episodes, train=train))
 
@@ -222,7 +222,7 @@ class Learning(ABC):
 
 
 def finish(progress: Generator[Event, None, Any], on_event: Callable[[Event], None] = lambda event: None) -> Any:
-    """Go through a step, or another part of a run, telling of its progress. Returns: what it returns."""
+    """Go through a step, or another generator of events, to its end. Returns: the generator's return value."""
     try:
         while True:
             on_event(next(progress))

@@ -12,12 +12,12 @@ from gridsim.maps.scenarios import build
 
 
 class Maps:
-    """The maps of one scenario, by their seeds, built by a thread until they are asked for."""
+    """The maps of one scenario, by their seeds; a thread builds them ahead."""
 
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self.config = scenario, config
         self._built: dict[int, Future[Map]] = {}
-        self._seeds: dict[int, int] = {}  # smallest seeds of the same maps
+        self._seeds: dict[int, int] = {}  # of each seed, the smallest seed with the same map
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
 
     def ahead(self, seeds: Sequence[int]) -> None:
@@ -36,7 +36,7 @@ class Maps:
         return future.result()
 
     def names(self, seeds: Sequence[int]) -> tuple[tuple[str, int], ...]:
-        """What pools know the maps of these seeds by."""
+        """The names by which pools know the maps of these seeds: scenario and seed."""
         return tuple((self._scenario, self._seed(seed)) for seed in seeds)
 
     def _seed(self, seed: int) -> int:
@@ -45,7 +45,7 @@ class Maps:
         return self._seeds[seed]
 
     def build(self, scenario: str, seed: int) -> Map:
-        """The map of the run's scenario and a seed, which is how pools ask for it."""
+        """`get`, as pools call it: with the scenario, which is the run's, and a seed."""
         return self.get(seed)
 
     def close(self) -> None:

@@ -67,7 +67,7 @@ class Recording:
 def record(
     champion: Champion, scenario: Map, start: np.ndarray, seconds: float, world: np.ndarray | None = None
 ) -> Recording:
-    """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for `seconds`.
+    """Drive from `start`, a pose float32 [5] or [8] (`state.START_FIELDS`), to the episode's end, or for `seconds`.
 
     Args: world float32 [others, TRAFFIC_FIELDS], the traffic at the start.
     """
@@ -84,7 +84,10 @@ def record(
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:
-    """The other cars' x, y (m) and heading (cosine, sine) [steps, others, 4] of traffic [..., TRAFFIC_FIELDS]."""
+    """Poses float32 [steps, others, 4] of other cars: x, y (m), heading (cosine, sine).
+
+    Args: `worlds` float32 [steps, cars, TRAFFIC_FIELDS]. Cars that are absent at any step are left out.
+    """
     return worlds[:, (worlds[:, :, LANE] >= 0.0).all(axis=0), :4]
 
 
@@ -120,7 +123,7 @@ def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") ->
 def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
-    Returns: how many there were. Raises: WriteError; a file that was there before is then kept.
+    Returns: the number of pictures. Raises: WriteError; a file that was there before is then kept.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

@@ -42,7 +42,7 @@ COMMAND = ["pedal", "wheel"]
 class Shown:
     """A drive on a page: the driver's name, a shorter name that is drawn beside its car, and the recording.
 
-    `stride` is the number of control steps between moments of the page; rays and outputs are shown only if it is 1.
+    `stride`: control steps from one moment of the page to the next; rays, outputs and route are shown only if it is 1.
     """
 
     label: str

@@ -28,9 +28,10 @@ def write_report(
     get_map: Callable[[int], Map],
     episodes: Episodes,
 ) -> None:
-    """Write curves.png, trajectory.png and drive.html: drives of champion and elites in the last road's first episode.
+    """Write curves.png (the history), trajectory.png (the champion's drive), drive.html (its drive, and elites').
 
-    Args: the history's rows; the network of each step, float32 [steps, genes]; a map by its seed.
+    All drives are in one episode, the last road's first one in `episodes`, which are the held-out ones. Args:
+    `history`, its rows; `elites`, the network of each step, float32 [steps, genes]; `get_map`, a map by its seed.
     """
     path, settings, limit = run.path, run.settings, champion.sim.episode.time_limit
     row = len(episodes.rows) - len(episodes.rows) // len(settings.crowds)

@@ -16,7 +16,7 @@ PICTURE = "stress.png"
 
 
 class Stress(NamedTuple):
-    """One thing that gets worse: a number of a part of the configuration, at each level."""
+    """One thing that gets worse: the number `name` in a part of the configuration, level by level."""
 
     label: str
     part: str
@@ -25,7 +25,7 @@ class Stress(NamedTuple):
     share: bool = False  # whether levels are shares of the champion's own number
 
     def at(self, level: float, sim: SimConfig) -> SimConfig:
-        """A configuration with this one at a level."""
+        """A configuration in which this number is at a level."""
         part = getattr(sim, self.part)
         value = level * getattr(part, self.name) if self.share else level
         return dataclasses.replace(sim, **{self.part: dataclasses.replace(part, **{self.name: value})})
@@ -53,7 +53,7 @@ def stresses(champion: Champion) -> list[Stress]:
 def drive(
     champion: Champion, chosen: Iterable[Stress], scenario: str, episodes: int, seed: int, traffic: Traffic | None
 ) -> Iterator[tuple[Stress, float, dict[str, float]]]:
-    """Drive it at each level of each stress. Yields: the stress, the level, and the figures of `evaluate`."""
+    """Drive a champion at each level of each stress. Yields: the stress, the level, and the figures of `evaluate`."""
     for stress in chosen:
         for level in stress.levels:
             worse = dataclasses.replace(champion, sim=stress.at(level, champion.sim))

@@ -1,4 +1,4 @@
-"""The suite: fixed drives in which champions of anybody are compared, and a digest by which their figures are checked.
+"""The suite: fixed drives in which anybody's champions are compared, and a digest by which their figures are checked.
 
 Figures of one NUMBER can be compared: whoever changes roads, traffic, car or the number of drives increases it.
 """
@@ -51,7 +51,7 @@ def report(champion: Champion, driven: list[tuple[str, int, np.ndarray]]) -> dic
 
 
 def earlier(path: Path) -> dict[str, Any]:
-    """What a suite.json holds; nothing if there is none. Raises: CheckpointError."""
+    """Suite, champion and digest of a suite.json; an empty dictionary if there is none. Raises: CheckpointError."""
     try:
         found = json.loads(path.read_bytes())
         return {name: found[name] for name in ("suite", "champion_sha256", "digest")}
@@ -62,7 +62,7 @@ def earlier(path: Path) -> dict[str, Any]:
 
 
 def compared(before: dict[str, Any], found: dict[str, Any]) -> str:
-    """What an earlier suite.json says of the same champion, in a line; "" if it has another one."""
+    """Whether an earlier suite.json had the same drives, in words; "" if it is of another champion or suite."""
     if any(before.get(name) != found[name] for name in ("suite", "champion_sha256")):
         return ""
     if before["digest"] == found["digest"]:

@@ -30,7 +30,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, roads_of, seed_of_map
 from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name
 
-SIM_FORMAT = 2  # of a champion's `sim`; in format 1, patience and progress were per control step
+SIM_FORMAT = 2  # of a champion's `sim`; in format 1, patience and progress counted control steps, not seconds
 GONE = ("apart", "kerb")  # parameters of traffic that no longer exist, in champions of the first format
 
 
@@ -42,7 +42,7 @@ class Champion:
     policy: str  #: its network, such as `mlp:6,7`
     scenario: str  #: where it learned
     sim: SimConfig  #: the simulator's parameters it learned with
-    traffic: Traffic = 0  #: other cars that it learned among, on each of several roads as many as is `usual` or `heavy`
+    traffic: Traffic = 0  #: other cars that it learned among: a number, or `usual` or `heavy`, which differ by road
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
@@ -67,7 +67,11 @@ class Champion:
         return other
 
     def crowds_on(self, scenario: str, asked: Traffic | None = None) -> tuple[int, ...]:
-        """Other cars on each road of a scenario: by default on its own as it learned, elsewhere as usual there."""
+        """The number of other cars on each road of a scenario.
+
+        By default as it learned, if it learned on all of these roads in a car of usual size (`SimConfig.unit` is 1);
+        else each road's default.
+        """
         if asked is None and self.sim.unit == 1.0 and {*roads_of(scenario)} <= {*roads_of(self.scenario)}:
             asked = self.traffic
         return crowds(scenario, asked, self.sim)
@@ -154,7 +158,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
 
 
 def _in_seconds(sim: dict[str, Any]) -> dict[str, Any]:
-    """A champion's `sim` of the first format as it is now."""
+    """A champion's `sim` of the first format, converted to the present one."""
     episode, period = sim["episode"], sim["episode"]["control_period"]
     episode = episode | {"patience": episode["patience"] * period, "progress": episode["progress"] / period}
     traffic = {name: value for name, value in sim.get("traffic", {}).items() if name not in GONE}
@@ -182,9 +186,9 @@ def evaluate(
 ) -> dict[str, float]:
     """Drive a champion through episodes on maps it never saw, in this process.
 
-    Args: a scenario's name (default: the champion's own), also of several roads; how many episodes on each road; the
-    first map's seed; other cars, usual, heavy or a number (default: as many as it learned among, or as another
-    scenario has by default); what `SimConfig.load` takes, in place of the simulator's numbers that it learned with.
+    Args: `scenario`, a name (default: the champion's own), also of several roads; `episodes` on each road; `seed` of
+    the first map; `traffic`, other cars, usual, heavy or a number (default: as many as it learned among, or as another
+    scenario has by default); `sim`, what `SimConfig.load` takes (default: the simulator's numbers it learned with).
     Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means), km_per_collision. With the defaults
     these are the held-out figures of summary.json.
     Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.

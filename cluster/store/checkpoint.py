@@ -83,7 +83,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
-    """Replace the file at `path` with `content`, on the disk, or leave it as it was and raise WriteError."""
+    """Replace the file at `path` with `content`, flushed to the disk, or leave it as it was and raise WriteError."""
     path = Path(path)
     temporary = path.with_name(f".{path.name}.tmp")  # a writer that is killed leaves it, until the next one writes
     try:

@@ -1,7 +1,7 @@
-"""The row of the history and the network of each step of a run, in one file that only grows.
+"""The row of the history and the network of each step of a run, as records of one file, steps.bin.
 
-The checkpoint counts its records, which are on the disk before it; those that a kill leaves uncounted are overwritten
-when the run goes on. history.csv and elites.npz are written from them.
+A record is on the disk before the checkpoint that counts it. If the run is killed in between, records that are not
+counted are overwritten when it goes on. history.csv and elites.npz are written from the records.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from evolution.networks.policy import PolicySpec
 class Steps:
     """The steps of a run that this process adds to.
 
-    Args: the run's folder; what a step is called; the history's columns; the size of a genome.
+    Args: the run's `folder`; `step_name`, what a step is called; the history's `columns`; `genes` of a genome.
     """
 
     def __init__(self, folder: Path, step_name: str, columns: Sequence[str], genes: int):
@@ -82,7 +82,7 @@ def read_elites(folder: Path, policy: str) -> np.ndarray:
 
 
 def write_elites(folder: Path, policy: str) -> np.ndarray:
-    """Write elites.npz, float32 [steps, genes] `genomes`. Returns them. Raises: CheckpointError."""
+    """Write elites.npz, which holds `genomes` float32 [steps, genes]. Returns: these. Raises: CheckpointError."""
     genomes = np.ascontiguousarray(read_elites(folder, policy))
     checkpoint.save(folder / ELITES, {"genomes": genomes}, {"policy": policy})
     return genomes

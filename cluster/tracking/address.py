@@ -41,8 +41,8 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
     If `uri` is None or "": the address `begun_with` of a resumed run, else MLFLOW_TRACKING_URI, else DEFAULT_URI. A
-    password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI. Not probed are the server of a
-    resumed run and of a run of a comparison (MLFLOW_RUN_CONTEXT), which go on without it, and hosted stores.
+    password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI. A server is not probed for a
+    resumed run or a comparison's run (MLFLOW_RUN_CONTEXT is set), which go on without it; a hosted store never is.
     Raises TrackingError for a server that does not answer, a database that cannot be written or is another MLflow's, a
     folder (MLflow 3 stores nothing in folders) and anything unknown.
     """
@@ -98,7 +98,7 @@ def _server_problem(uri: str) -> str:
 
 
 def run_table(server: str, experiment_id: str) -> str:
-    """Address of an experiment's run table in an MLflow server's UI, as MLflow 3.17 opens another page by default."""
+    """Address of an experiment's run table in an MLflow server's UI; by default MLflow 3.17 opens another page."""
     page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
     return f"{redacted(server)}/{page}"
 
@@ -114,7 +114,7 @@ def is_database(uri: str) -> bool:
 
 
 def is_locked(error: str | None) -> bool:
-    """Whether an upload failed only because others write to the database, which ends."""
+    """Whether an upload failed only because others are writing to the database, which soon passes."""
     return "database is locked" in (error or "")
 
 
@@ -151,7 +151,7 @@ def _check_sqlite(uri: str) -> str:
                 if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'alembic_version'").fetchall():
                     found = database.execute("SELECT version_num FROM alembic_version").fetchall()
         except sqlite3.Error as error:
-            if not is_locked(str(error)):  # the tracker waits for it
+            if not is_locked(str(error)):  # `sync` waits for a locked one
                 raise TrackingError(f"{shown}: not a database that can be written: {error}") from error
     if found and (problem := schema_problem(found[0][0], absolute)):
         raise TrackingError(problem)

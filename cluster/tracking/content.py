@@ -33,5 +33,5 @@ class Content:
     result: str = ""  # appended to the description when the run ends; `{run_id}` becomes MLflow's id of the run
     files: list[Path] = field(default_factory=list)  # sent at the end
     model: Model | None = None  # sent at the end
-    finished: bool = False  # a finished run's status, end and files in MLflow stay as they are
+    finished: bool = False  # whether it is finished; then its status, end and files in MLflow stay as they are
     wall_s: float = 0.0  # seconds from the start to the last row or the end, without pauses

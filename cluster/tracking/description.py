@@ -114,7 +114,7 @@ def held_out_metrics(summary: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _plain(road: str) -> str:
-    """A road's label as a part of MLflow's names, where an @ would be read as an alias."""
+    """A road's label as a part of MLflow's names: other characters become "_", as MLflow takes an @ for an alias."""
     return re.sub(r"[^\w.-]", "_", road)
 
 

@@ -1,6 +1,6 @@
 """A folder's run in MLflow: found or created, and sent what it lacks of the folder's content. Imports MLflow.
 
-Everything here blocks and may raise whatever MLflow raises; any call can be repeated. What an object holds is only what
+Everything here blocks and may raise whatever MLflow raises; any call can be repeated. An object remembers only what
 MLflow was seen to have. Models are written here and never loaded.
 """
 
@@ -92,7 +92,7 @@ class LoggedRun:
         return error
 
     def _identify(self, content: Content) -> dict[str, Any]:
-        """Write and return mlflow.json, by which a run is found again that was killed, or had no server."""
+        """Write and return mlflow.json, by which a run that was killed, or had no server, is found again."""
         link = read_link(self._folder)
         if link.get("uri") != redacted(self._uri):
             experiment = self._experiment or os.environ.get("MLFLOW_EXPERIMENT_NAME") or "gridsim"
@@ -168,7 +168,7 @@ class LoggedRun:
         return client.create_run(experiment.experiment_id, int(1000.0 * link["started"]), tags, name)
 
     def _missing_rows(self, content: Content) -> dict[tuple[str, int], tuple[float, float]]:
-        """Value and wall_s of each (metric, step)."""
+        """Value and wall_s of each (metric, step) that MLflow was not seen to have."""
         return {
             (name, step): (float(value), wall_s)
             for step, metrics, wall_s in content.rows
@@ -198,9 +198,9 @@ class LoggedRun:
                 self.sent["file"] += 1
 
     def _upload(self, path: Path, folder: str | None = None) -> None:
-        """Store a file; one by one, as MLflow's own pool of threads would hold up the exit if a server hangs.
+        """Store one file. MLflow's own pool of threads for several would hold up the exit if a server hangs.
 
-        Raises TrackingError, which names the folder, if it is kept in one that is not there or cannot be written.
+        Raises TrackingError, which names the folder, if files are kept in one that is missing or cannot be written.
         """
         from mlflow.utils.file_utils import local_file_uri_to_path
         from mlflow.utils.uri import is_local_uri
@@ -246,7 +246,7 @@ class LoggedRun:
         self._registered = True
 
     def _register(self, model: Model) -> None:
-        """Make the stored model the newest version of its name, unless it is one; the best of all gets the alias."""
+        """Make the stored model the newest version of its name, unless it is one already; the best one becomes BEST."""
         from mlflow.exceptions import MlflowException
 
         client, source = self._client, f"{self._location.rstrip('/')}/{MODEL}"
@@ -316,7 +316,7 @@ def _view() -> str:
 
 
 def read_link(folder: Path) -> dict[str, Any]:
-    """What mlflow.json holds; empty without a whole one."""
+    """What mlflow.json holds; an empty dictionary if it is missing or incomplete."""
     try:
         link = json.loads((folder / MLFLOW).read_bytes())
         return {name: kind(link[name]) for name, kind in LINK.items()}

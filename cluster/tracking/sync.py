@@ -1,7 +1,7 @@
 """The process that sends a folder to MLflow, which `tracking.py` starts: `python -m cluster.tracking.sync`.
 
 It syncs every few seconds: it sends what the folder has and MLflow lacks. It ends after the last sync, or as soon as
-the process that started it has ended, however that did.
+the process that started it has ended, even if that was killed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cluster.tracking.address import is_database, is_locked
 from cluster.tracking.database import configure_mlflow
 from cluster.tracking.logged import LoggedRun, Status
 
-SYNC_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
+SYNC_S = 2.0  # rows that come within this time are one request: a row takes 5 ms of CPU alone, 0.8 ms among many
 RETRY_S = 5.0  # after a sync that failed
 LAST_RETRY_S = 1.0  # between the last syncs
 

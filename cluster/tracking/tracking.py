@@ -64,7 +64,7 @@ class Tracking:
             self._listener.start()
 
     def wait_id(self, timeout_s: float) -> str:
-        """MLflow's id of the run; "" if there is none by then, or as soon as a sync has failed."""
+        """Wait for MLflow's id of the run; "" if there is none by then, or as soon as a sync has failed."""
         end = time.monotonic() + timeout_s
         while self._process and not self.run_id and time.monotonic() < end:
             if self.error is not None and not is_locked(self.error):
@@ -131,7 +131,7 @@ class Tracking:
 
 
 def sync(folder: Path, uri: str, experiment: str, read: Read, status: Status = "FINISHED") -> tuple[str, str | None]:
-    """Send what MLflow lacks of a folder that nobody is at work on, to the folder's own address if `uri` is "".
+    """Send what MLflow lacks of a folder that no run is using; if `uri` is "", to where it was last sent.
 
     Returns: what was sent, in words, and None or one line about what could not be.
     """

@@ -13,10 +13,11 @@ CONNECT_S = 3.0  # at most, until something answers at an address
 
 
 def cluster_address(given: str) -> str | None:
-    """The Ray cluster meant by --address, else by RAY_ADDRESS: `host:port` or `auto`; None for a Ray of our own.
+    """The Ray cluster to join, `host:port` or `auto`; None: this machine alone.
 
-    Ray's guide sets RAY_ADDRESS to http://..., where Ray takes jobs: that is no cluster to join, and is left out with a
-    warning. Raises PoolError as `check_address`.
+    It is `given` (--address), or RAY_ADDRESS if that is set and `given` is "" or `auto`. Ray's guide sets RAY_ADDRESS
+    to http://..., where Ray takes jobs: no cluster to join, so it is ignored with a warning. Raises PoolError as
+    `check_address`.
     """
     usual = os.environ.get("RAY_ADDRESS", "")
     if usual == "" or given not in ("", "auto"):

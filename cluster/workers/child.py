@@ -45,7 +45,7 @@ class Child:
         return self.exit_code() is None
 
     def terminate(self) -> None:
-        """Send it SIGTERM."""
+        """End the pipe: the shell sends SIGTERM to the command and, after GRACE_S, SIGKILL to its whole session."""
         assert self._process.stdin
         self._process.stdin.close()
 

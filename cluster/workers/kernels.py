@@ -72,7 +72,7 @@ def compile_ahead(settings: RunSettings) -> None:
     what += [OWN] if has_own(settings) else []
     compilers = list[Child]()
     try:
-        for part in PARTS:  # -P: not from this folder
+        for part in PARTS:  # -P: no module of the working folder is imported
             compilers.append(Child([sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what]))
         while None in (codes := [compiler.exit_code() for compiler in compilers]):
             stopping.check()
@@ -110,7 +110,7 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
 
 
 def everything_by_default() -> list[RunSettings]:
-    """Settings that between them need all that the learners compile by default."""
+    """Settings of runs that together need all kernels that the learners need by default."""
     return [
         kind(scenario=scenario, traffic=traffic, observation=observation)
         for scenario in REGISTRY

@@ -11,10 +11,10 @@ def open_pool(workers: int, address: str | None, patience_s: float, build_map: B
 
     Args:
         workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
-        address: of an existing Ray cluster (`host:port` or `auto`), with 0 workers as many as it has CPUs free; None is
-            a Ray of our own.
-        patience_s: how long to do without any Ray worker, and to wait for a silent one; 0 is 300 s, but 60 s for the
-            answer of a worker on this machine.
+        address: an existing Ray cluster (`host:port` or `auto`), on which 0 workers mean one for each free CPU; None: a
+            Ray of our own.
+        patience_s: how long to go on without any Ray worker, and to wait for a silent one; 0: 300 s, but 60 s for a
+            silent one in a Ray of our own.
 
     Raises: PoolError, in one line.
     """

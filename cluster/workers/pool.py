@@ -19,7 +19,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.state import START_FIELDS
 
-BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; remembers the latest
+BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; each call asks again, so it keeps its maps
 
 LOOK_S = 0.1  # between two looks at whether the run is to be stopped
 
@@ -140,9 +140,9 @@ AnyCall = TypeVar("AnyCall", bound=Call)
 class WorkerPool(ABC):
     """Evaluates generations and collects experience, one call at a time.
 
-    A call is started and waited for; its owner may do other work between two waits, for some tens of milliseconds. What
-    a call returns depends on its arguments alone, never on the workers. A call that is started while another one is
-    under way takes its place.
+    A call is started and waited for. Its owner may do other work between two waits, but some tens of milliseconds at a
+    time: Ray workers hold two pieces of work, and get more only in `wait`. What a call returns depends on its arguments
+    alone, never on the workers. A call that is started while another one is under way takes its place.
     Raises: PoolError if what is asked for cannot be done; the pool can be used again.
     """
 
@@ -150,7 +150,7 @@ class WorkerPool(ABC):
     _call: Call | None = None  # the latest one, unless it failed; others are left undone
 
     def start(self, call: AnyCall) -> AnyCall:
-        """Have a call done. Returns it at once."""
+        """Begin a call, and return it at once."""
         self._call = call
         self._start(call)
         return call
@@ -177,7 +177,7 @@ class WorkerPool(ABC):
 
     @abstractmethod
     def _start(self, call: Call) -> None:
-        """Have a call done in place of the one before."""
+        """Begin a call, in place of the one before."""
 
     @abstractmethod
     def _take_in(self, timeout_s: float) -> None:
@@ -198,7 +198,7 @@ def cut(call: Call, workers: int, least_m: float, most_m: float) -> list[Chunk]:
     Args: the least and the most metres of a piece. A metre takes a small network some microseconds at most.
     """
     episodes = call.task.episodes
-    goals = np.maximum(np.minimum(episodes["target"], episodes["steps"]), 1).astype(np.float64)  # a step for a metre
+    goals = np.maximum(np.minimum(episodes["target"], episodes["steps"]), 1).astype(np.float64)  # a step counts as 1 m
 
     def metres(chunk: Chunk) -> float:
         return (chunk.rows.stop - chunk.rows.start) * float(goals[chunk.columns].sum())

@@ -25,16 +25,16 @@ from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # with workers on this machine; on a cluster, which may still be growing
-MAX_KILLS = 3  # workers that a piece may cost
+PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a silent worker of a Ray of our own; of a cluster, or without a worker
+MAX_KILLS = 3  # deaths of workers over one piece at which the call fails
 MAX_DEATHS = 8  # workers that may die in a row without an answer in between, or 3 times their number if that is more
 QUEUED = 2  # pieces that a worker is sent, so that it need not wait for the next one
-LEAST_M, MOST_M = 5_000.0, 40_000.0  # metres in a piece; the largest networks take 1 ms for each, so less than patience
-MANY_M = 400.0  # for each worker in a smallest piece, which so takes as long as sending all others theirs
+LEAST_M, MOST_M = 5_000.0, 40_000.0  # metres in a piece; at 1 ms each, the largest networks need less than PATIENCE_S
+MANY_M = 400.0  # metres per worker in a smallest piece: it takes as long as sending all other workers theirs
 
 
 class Actor:
-    """A worker's process. It keeps the current task, and the run's maps, of which there are at most 240."""
+    """A worker's process. It keeps the current task, and the run's maps, of which there are some hundreds at most."""
 
     def __init__(self, factory: Callable[[], Worker]):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the coordinator ends its workers

@@ -60,13 +60,13 @@ _has_token = False  # whether OWN_ENVIRONMENT was set when Ray was imported, whi
 
 
 class Session:
-    """This process's connection to a cluster, or to a Ray of our own: `ray start`, its files in a private folder."""
+    """This process's connection to a cluster, or to a Ray of our own, which `ray start` runs in a private folder."""
 
     _folder, _joined = "", False
     _head: Child | None = None
 
     def open(self, cpus: int, address: str | None, patience_s: float) -> Any:
-        """Join a cluster, or start a Ray of our own with so many CPUs. Returns the module `ray`. Raises PoolError."""
+        """Join a cluster, or start a Ray of our own with `cpus` CPUs. Returns the module `ray`. Raises PoolError."""
         global _has_token
         ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
         if ray and getattr(ray, "is_initialized", bool)():

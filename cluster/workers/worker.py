@@ -34,7 +34,7 @@ class Task(_Common):
     """A generation. A call says which members (recipes) drive which episodes."""
 
     parents: np.ndarray  # genomes float32 [parents, genes] that the recipes name
-    key: int  # the generation's number for breeding, 64 bits
+    key: int  # seed of the generation's random numbers, 64 bits
     mutation: Mutation  # how children differ from their parents
     comfort: bool = False  # whether results have figures of comfort, which take time
 
@@ -59,7 +59,7 @@ class Worker:
     """
 
     def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, columns: slice) -> tuple[Any, ...]:
-        """Do a chunk: recipes RECIPE [n] of a `Task`, on some of the task's episodes.
+        """Do a chunk: recipes RECIPE [n] (not used by a `CollectTask`), on the episodes `columns` of the task.
 
         Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
         """

@@ -8,9 +8,9 @@ estimated from row T.
 Observations are the network's inputs in a format small enough to keep a million of them:
 
 * rays: int16 [inputs], what `policy.normalise` makes, in units of 1/4096 and clipped to [-8, 8);
-* grid: uint8 [1602], one frame, and then the speed input as little-endian int16 in the same units. A cell takes two
-  bits, 0, 1 and 2 for unknown, free and occupied: cell k is bits 2 (k mod 4) and the next of byte k // 4. The frames
-  of a stack are those of the rows before; frames before the episode's first row are copies of that row's frame.
+* grid: uint8 [1602], one frame, then the speed input as little-endian int16 in the same units. A cell takes two bits:
+  0, 1 and 2 for unknown, free and occupied. Cell k is in byte k // 4, in bit 2 (k mod 4) and the bit above it. The
+  earlier frames of a stack are in the rows before; before the episode's first row they are copies of its frame.
 """
 
 from __future__ import annotations
@@ -77,14 +77,14 @@ def to_fixed_point(value):
 
 @leaf
 def store_rays(inputs, row):
-    """Store the inputs float32 [inputs or more] of a network on rays as row int16 [inputs]."""
+    """Store `inputs` float32 [inputs or more], of a network that sees rays, in `row` int16 [inputs]."""
     for i in range(row.shape[0]):
         row[i] = to_fixed_point(inputs[i])
 
 
 @leaf
 def store_grid(grid, speed, row):
-    """Store a grid uint8 [6400] and a speed (m/s) as row uint8 [1602]."""
+    """Store a grid uint8 [6400] and a speed (m/s) in `row` uint8 [1602]."""
     for i in range(_FRAME):
         byte = 0
         for j in range(4):  # the codes 0, 127 and 255 become 0, 1 and 2
@@ -124,8 +124,8 @@ def unpack(spec: PolicySpec, observations: np.ndarray, rows: np.ndarray, ages: n
     Args:
         observations: as in `Experience`, or a ring buffer of them, in which row 0 follows the last one.
         rows: int64 [n], not checked.
-        ages: [n], `ages` of these rows. If a ring has lost the beginning of an episode, the age is the number of its
-            remaining rows before this one.
+        ages: [n], `ages` of these rows; greater ages than spec.frames - 1 may be given as that. All rows that hold
+            frames of these stacks must still be there.
     """
     inputs = np.empty((len(rows), spec.inputs), dtype=np.float32)
     if isinstance(spec, CnnSpec):

@@ -34,7 +34,7 @@ from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS
 
 T = TypeVar("T", np.ndarray, float)
-RANDOM_SHARE = 0.02  # share of --anneal in which exploration falls from 1 to each episode's own share
+RANDOM_SHARE = 0.02  # share of --anneal during which exploration falls from 1 to each episode's own share
 SPREAD = 7.0  # exploration ranges from epsilon to epsilon ** (1 + SPREAD) (alpha of Horgan et al. 2018)
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
@@ -48,12 +48,12 @@ class DqnConfig:
     batch: int = 256  # transitions of an update
     learning_rate: float = 1e-3  # Adam's, at the beginning
     final_learning_rate: float = 0.05  # Adam's at the end, as a share of `learning_rate`
-    learning_rate_updates: int = 50_000  # over which it falls linearly
+    learning_rate_updates: int = 50_000  # updates over which the learning rate falls linearly
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target
     average: int = 2000  # time constant, in updates, of the exponential average of weights (Polyak and Juditsky 1992)
-    # Error above which the loss is linear. As large as returns: with 1 (Mnih et al. 2015), Q estimates the median
-    # return, and underweights rare crashes.
+    # Error above which the loss is linear. It is as large as returns: with 1 (Mnih et al. 2015), Q would estimate the
+    # median return, in which rare crashes have too little weight.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
 
@@ -64,10 +64,10 @@ class DqnConfig:
 
 
 def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
-    """Shares of random actions in a batch's episodes, which decline from 1 to an own share each: float32 [episodes].
+    """Share of random actions in each episode of a batch: float32 [episodes].
 
-    Args: epsilon, the own share of the first episode (those of later ones are smaller); progress, car-steps so far as a
-    share of --anneal.
+    It falls from 1 to a share of the episode's own. Args: `epsilon`, the first episode's own share (later episodes have
+    smaller ones); `progress`, car-steps so far, divided by --anneal; `episodes`, their number.
     """
     usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
     random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)
@@ -75,7 +75,7 @@ def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
 
 
 def finite(numbers: T, update: int) -> T:
-    """Weights, values or a loss, unchanged. Raises: FloatingPointError if they are not finite."""
+    """Return weights, values or a loss unchanged. Raises: FloatingPointError if any of them is not finite."""
     if not np.isfinite(numbers).all():
         raise FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
     return numbers
@@ -160,7 +160,7 @@ class QNetwork:
         one, two, _ = spec.hidden
         (w1, b1), (w2, b2), (w3, b3), (w4, b4) = self.layers
         frames, speed = x[:, :-1].reshape(-1, spec.frames, CELLS, CELLS), x[:, -1:]
-        # A genome orders a unit's inputs (frame, row, column), then (row, column, channel).
+        # A genome orders a unit's inputs (frame, row, column) in the first layer, (row, column, channel) in the second.
         w1 = w1.view(spec.frames, KERNEL_1, KERNEL_1, one).permute(3, 0, 1, 2)
         w2 = w2.view(KERNEL_2, KERNEL_2, one, two).permute(3, 2, 0, 1)
         x = torch.relu(torch.nn.functional.conv2d(frames, w1, b1, stride=STRIDE_1))
@@ -206,7 +206,7 @@ class DqnLearner:
 
     @property
     def average(self) -> np.ndarray:
-        """The average over the latest updates, which drives better than the network itself: float32 [genes], a copy."""
+        """The average genome of the latest updates; it drives better than the last one: float32 [genes], a copy."""
         return self._average.cpu().numpy().copy()
 
     def load_weights(self, genome: np.ndarray) -> None:
@@ -215,7 +215,7 @@ class DqnLearner:
             tensor.copy_(torch.from_numpy(genome))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        """A copy on the device. PyTorch aligns its memory alike in all processes, and rounding depends on alignment."""
+        """A copy on the device. Rounding depends on alignment, and PyTorch aligns copies alike in all processes."""
         return torch.from_numpy(array).to(self.device, copy=True)
 
     def targets(self, batch: Batch) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
 action and the row after it. The value of the latter counts unless the step terminated the episode (`state.End`).
-Rows of grids that have lost earlier frames of their stack are no longer drawn.
+A row of a grid is no longer drawn once an earlier frame of its stack is overwritten.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Replay:
         self.transitions = 0  # rows that can be drawn
         self._earlier_frames = spec.frames - 1 if isinstance(spec, CnnSpec) else 0
         age = np.empty(capacity, dtype=np.uint8)  # earlier rows of the episode, at most `_earlier_frames`
-        self._rings = {**empty(spec, capacity)._asdict(), "ages": age}  # a large ring grows as it fills
+        self._rings = {**empty(spec, capacity)._asdict(), "ages": age}  # takes memory only as it fills
         self._drawable = np.zeros(capacity, dtype=np.bool_)
 
     def __len__(self) -> int:
@@ -60,7 +60,7 @@ class Replay:
         return min(self.added, self.capacity)
 
     def add(self, experience: Experience) -> None:
-        """Append whole episodes over the oldest rows; of more rows than the capacity, the last ones are kept."""
+        """Append whole episodes, which overwrite the oldest rows; of more rows than `capacity`, the last are kept."""
         rows = len(experience.actions)
         kept = min(rows, self.capacity)
         first = (self.added + rows - kept) % self.capacity
@@ -72,14 +72,14 @@ class Replay:
         self._exclude_incomplete_stacks()
 
     def _exclude_incomplete_stacks(self) -> None:
-        """Exclude the oldest rows, whose earlier frames are overwritten, from being drawn."""
+        """Exclude from drawing those of the oldest rows whose earlier frames are overwritten; count `transitions`."""
         oldest = self.added - len(self)
         places = (oldest + np.arange(min(self._earlier_frames, len(self)))) % self.capacity
         self._drawable[places[self._rings["ages"][places] > np.arange(len(places))]] = False
         self.transitions = int(np.count_nonzero(self._drawable[: len(self)]))
 
     def sample(self, key: int, batch: int) -> Batch:
-        """Draw transitions with replacement, which depend only on the key, in [0, 2^64), and the replay's contents.
+        """Draw `batch` transitions with replacement. They depend only on `key`, in [0, 2^64), and on what is stored.
 
         Raises: ValueError if there are none.
         """

@@ -1,9 +1,10 @@
 """The curriculum: the episodes of each generation, and validation, which chooses the champion.
 
 Episodes begin short, since at first the best members drive into the first bend at full speed, and their length doubles
-when the leader (the best genome known before a generation) succeeds. Half of them, in traffic most, start shortly
-before a crash of an earlier leader, mostly where half of the members crash again: there is most to learn. Each group of
-a generation has its own, so that selection uses many although each member drives few. Several roads take turns.
+when the leader (the best genome known before a generation) succeeds. Half of the episodes, in traffic most of them,
+start shortly before a crash of an earlier leader. There is most to learn where half of the members crash again, so such
+starts are the likeliest. Each group of members has episodes of its own, so that selection uses many although each
+member drives few. With several roads, the episodes are on each of them in turn.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
@@ -40,7 +41,7 @@ class CurriculumConfig:
     first_maps: int = 4  # of these, how many the first generation uses; each later one uses one more
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes for each group and generation
-    crash_starts: int = 1  # short episodes, for each too, that start before a crash of a recent leader
+    crash_starts: int = 1  # short episodes for each group and generation that start before a crash of a recent leader
     crash_target: float = 120.0  # m, target of crash starts
     crash_memory: int = 24  # crashes that are remembered
     crowd: float = 2.0  # factor on the number of other cars in training, for more encounters over the same distance
@@ -48,20 +49,20 @@ class CurriculumConfig:
     leader_episodes: int = 16  # episodes of the leader in each generation
     leader_stretch: float = 2.5  # target of the leader's episodes, relative to the members'
     first_target: float = 150.0  # m, target of the first episodes
-    last_target: float = 400.0  # m, largest target of training; further starts teach as much as longer episodes
+    last_target: float = 400.0  # m, largest target of training; more starts teach as much as longer episodes
     growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
-    # Of each road, m/s: mean speed required by a training episode's time limit; seamless's, like champion_pace.
+    # Of each road, m/s: mean speed that a training episode's time limit requires. The default is for `seamless`.
     pace: tuple[float, ...] = (7.0,)
     slack: float = 3.0  # s, added to that time limit
-    promising: float = 0.5  # least success rate of the leader, over `latest` generations, before one is validated
+    promising: float = 0.5  # least mean success rate of the leaders of the `latest` generations for a validation
     latest: int = 4  # generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
     validation: int = 256  # episodes of validation on each road
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
 
-# What differs in traffic, where crashes become rare long before the search has learned from them all that it could:
-# most episodes start before one of many crashes, and validation can tell 1 % of failures from 2 %.
+# What differs in traffic. There, crashes become rare long before the search has learned all that it could from them, so
+# most episodes start before one of many crashes. Validation is long enough to tell 1 % of failures from 2 %.
 IN_TRAFFIC: dict[str, Any] = {
     "starts": 1,
     "crash_starts": 8,
@@ -74,10 +75,10 @@ IN_TRAFFIC: dict[str, Any] = {
 def spread_starts(
     build: Callable[[int], Map], seeds: range, episodes: int, crowds: Sequence[int], config: SimConfig, room: int = 0
 ) -> Episodes:
-    """Full episodes, as many on each road, one road after the other: on its maps of its own `seeds` in turn.
+    """Full episodes, `episodes` on each road, one road after the other; a road's are on its maps of `seeds` in turn.
 
-    A road's episodes are the same whichever other roads there are. Args: `crowds`, the number of other cars on each
-    road; `room`, the least number of cars in the arrays, as in `lane_starts`.
+    A road's episodes are the same whichever other roads there are. Args: `build` makes the map of a seed; `crowds`, the
+    number of other cars on each road; `room`, the least number of cars in the arrays, as in `lane_starts`.
     """
     used, roads = np.arange(episodes) % len(seeds), list[Episodes]()
     for k, traffic in enumerate(crowds):
@@ -95,7 +96,7 @@ class Curriculum:
         self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], sim: SimConfig,
         crowds: Sequence[int] = (0,),
     ):  # fmt: skip
-        """Args: other cars on each road."""
+        """Args: `build` makes the map of a seed; `crowds`, the number of other cars on each road."""
         self.config, self.seed, self.build, self.sim = config, seed, build, sim
         self.roads, self.crowds = len(crowds), crowds
         self.training_crowds = [round(config.crowd * cars) for cars in crowds]
@@ -115,7 +116,7 @@ class Curriculum:
     def _starts(
         self, seeds: Sequence[int], maps: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Episodes and their traffic, of training, on maps [e] that index `seeds`."""
+        """Training episodes on the maps of `seeds` that `maps` [e] indexes, and their traffic."""
         cars, room = [self.training_crowds[road_number(seed, self.roads)] for seed in seeds], max(self.training_crowds)
         return lane_starts([self.build(seed) for seed in seeds], maps, rng, cars, self.sim, room)
 
@@ -124,9 +125,9 @@ class Curriculum:
         return min(self.config.maps, self.config.first_maps + generation)
 
     def _limit(self, episodes: np.ndarray, seeds: Sequence[int], target: float) -> None:
-        """Set the target (m) of training episodes EPISODE [e], and the time limit that follows from it on their roads.
+        """Set the target (m) of training episodes EPISODE [e], and the time limits that follow from it and the pace.
 
-        Args: seeds of the maps that the episodes index.
+        Args: `seeds`, of the maps that the episodes index.
         """
         pace = np.array(self.config.pace)[[road_number(seeds[m], self.roads) for m in episodes["map"]]]
         episodes["target"] = target
@@ -135,7 +136,7 @@ class Curriculum:
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator, first: int) -> np.ndarray:
         """Training maps [count] as indices into `map_seeds`; without repetition if there are enough.
 
-        They are of the roads in turn, from number `first` on.
+        The k-th one is of road first + k, modulo the number of roads.
         """
         roads, maps = (first + np.arange(count)) % self.roads, np.empty(count, dtype=np.int64)
         for road in np.unique(roads):
@@ -150,9 +151,9 @@ class Curriculum:
         return Episodes(seeds, *self._starts(seeds, local, rng))
 
     def episodes(self, generation: int) -> Episodes:
-        """A generation's episodes, group by group: first new starts, then crash starts, as many in each group."""
+        """A generation's episodes, group by group: in each group so many new starts, then so many crash starts."""
         config, rng = self.config, self._rng(generation, 0)
-        # Where a group has too few episodes for all roads, others of the generation, and its next ones, have the rest.
+        # If a group has too few new starts for all roads, other groups and the next generations have the other roads.
         firsts = [(generation + group) * config.starts for group in range(config.groups)]
         maps = [self._some_maps(generation, config.starts, rng, first) for first in firsts]
         fresh = self._new_starts(np.concatenate(maps), rng)
@@ -187,13 +188,13 @@ class Curriculum:
             self.failures[crashes] = (self.failures[crashes] + failed) / 2.0
 
     def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
-        """Distribute each kind [e, ...] over the groups, and concatenate group by group."""
+        """Divide each of the arrays [e, ...] among the groups, and concatenate them group by group."""
         n = self.config.groups
         parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
         return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
-        """`count` new full episodes on the training maps, by default for the DQN's batches."""
+        """`count` new full episodes on the training maps. They differ by `purpose`; by default they are for the DQN."""
         rng = self._rng(batch, purpose)
         return self._new_starts(self._some_maps(batch, count, rng, batch * count), rng)
 
@@ -207,10 +208,10 @@ class Curriculum:
     def learn_from_leader(
         self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray
     ) -> None:
-        """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
+        """Learn from the leader's episodes: remember its crashes (terminating ends); if it succeeds, raise the target.
 
-        Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 7], and the traffic
-        at that time, float32 [e, cars, TRAFFIC_FIELDS].
+        Args: `episodes` of `leader_episodes`; `results` RESULT [e]; `rewound`, the states `rewind` steps before their
+        ends, as starts float32 [e, 8]; `worlds`, the traffic at that time, float32 [e, cars, TRAFFIC_FIELDS].
         """
         crashed = TERMINATES[results["end"]] & (results["steps"] > 10)
         if crashed.any():
@@ -228,7 +229,7 @@ class Curriculum:
     def validation(self, seeds: range = VALIDATION_SEEDS) -> Episodes:
         """Validation's episodes on maps of `seeds`, the same for all runs of a scenario with the same traffic.
 
-        They share a task with a generation's episodes, so there is room for as many cars.
+        A task may hold them beside a generation's episodes, so their arrays have room for as many cars.
         """
         if seeds not in self._validation:
             episodes, room = self.config.validation, max(self.training_crowds)
@@ -238,7 +239,7 @@ class Curriculum:
     def validation_scores(self, results: np.ndarray) -> np.ndarray:
         """Scores in [0, 1] on each road, float64 [roads], from a member's results in validation, RESULT [e].
 
-        They are success rates, reduced below champion_pace.
+        They are success rates, times mean speed / champion_pace where that is below 1.
         """
         on_each = results.reshape(self.roads, -1)
         metres = on_each["distance"].astype(np.float64).sum(axis=1)

@@ -10,8 +10,8 @@ from gridsim.state import End
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
     """Means over the episodes of one member, RESULT [e]; `period_s` is the control period.
 
-    Kilometres per collision are those of all episodes over their collisions; without a collision all of them, so that
-    it takes more than that.
+    Kilometres per collision are the kilometres of all episodes, divided by their collisions. Without a collision they
+    are all kilometres, which is a lower bound.
     """
     kilometres, collisions = results["distance"].sum(dtype=np.float64) / 1000.0, results["end"] == End.COLLISION
     return {
@@ -25,6 +25,6 @@ def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
 
 
 def mean_speed(results: np.ndarray, period_s: float) -> float:
-    """Mean over episodes of new ground over time, in m/s."""
+    """Mean speed in m/s: new ground divided by time, averaged over episodes."""
     seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
     return float((results["distance"] / seconds).mean())

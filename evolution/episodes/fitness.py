@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LINEAR_SHARE = 0.4  # of the score is linear in the distance; on a log scale alone, the last km counts almost nothing
+LINEAR_SHARE = 0.4  # share of the score that is linear in the distance; on a log scale, the last km counts for little
 PACED_SHARE = 0.7  # weight of the paced distance in the scalar; the rest is for the distance
 PACED_ENOUGH = 0.8  # if this share of the distance is paced, all of it counts: braking for others costs nothing
 

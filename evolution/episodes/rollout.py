@@ -59,7 +59,7 @@ Buffers = tuple[GridBuffers | None, np.ndarray | None]
 
 
 def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
-    """Buffers for grids, if the policy sees these, and for pedal and wheel, float32 [2], if it decides these.
+    """Buffers for grids, if the policy sees grids, and for pedal and wheel, float32 [2], if it sets these; else None.
 
     Raises: GridSimError if the sensor has a wrong number of rays.
     """
@@ -86,7 +86,7 @@ class Workspace(NamedTuple):
     car: np.ndarray  # float32 [CAR_FIELDS]
     visits: np.ndarray  # float32 [cells]
     ranges: np.ndarray  # float32 [rays]
-    closing: np.ndarray  # float32 [rays], [0] if it is not seen
+    closing: np.ndarray  # float32 [rays], closing speeds of other cars, m/s; [0] if the policy does not see them
     observation: np.ndarray  # float32 [values]
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
@@ -162,7 +162,7 @@ def _observe(simulation, car, world, workspace, grid_buffers):
 
 @exact
 def _observed_speed(simulation, observation):
-    """The speed (m/s) that a network on the grid reads from its observation, whose last value it is."""
+    """The speed (m/s) that a network on the grid sees: the observation's last value, a share of the speed limit."""
     return observation[observation.shape[0] - 1] * simulation.constants.speed_limit
 
 
@@ -215,7 +215,7 @@ def _act(constants, car, history, action, command):
 def _drive(simulation, setup, car, workspace, world, action):
     """One control step with an action. Returns an End as a number.
 
-    A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
+    A `leaf`, which counts no references. Inside `run_episode` this code would, and be 15 % slower among 8 cars.
     """
     acceleration, steering = _act(simulation.constants, car, workspace.history, action, workspace.command)
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
@@ -228,7 +228,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
     Args: notes, float32 [comfort.NOTES], sum up the figures of comfort; with None the result does not get these.
 
     If an output of the network is NaN, the episode ends as IDLE, and so does the last step of its recording. What may
-    be None is an argument of its own, because Numba prunes `is None` branches on arguments but not on fields.
+    be None is no field of a record but an argument: Numba prunes `is None` branches on arguments but not on fields.
     """
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
@@ -325,10 +325,10 @@ def evaluate(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
 
-    Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
-    with, float32 [e, cars, TRAFFIC_FIELDS]; whether results have the figures of comfort.
-    Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
-    start of shorter ones, as starts float32 [n, k, 8]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
+    Args: `genomes` float32 [n, spec.size]; `road_maps`, which the episodes index; `episodes` EPISODE [e]; `worlds`, the
+    traffic at their starts, float32 [e, cars, TRAFFIC_FIELDS]; `with_comfort`: results have the figures of comfort.
+    Returns: (RESULT [n, e]; for the k episodes with `rewind` above 0, the states that many steps before their ends, or
+    at the start of shorter ones, as starts float32 [n, k, 8]; the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -370,8 +370,8 @@ def collect(
 ) -> tuple[Experience, np.ndarray]:
     """Drive one policy through every episode, with some random actions, and record its experience.
 
-    Args: as `evaluate`'s; weights float32 [spec.size]; each episode's share of random actions, float32 [e], and the
-    seed of its random numbers, uint64 [e].
+    Args: as `evaluate`'s; `weights` float32 [spec.size]; `epsilons`, each episode's share of random actions, float32
+    [e]; `keys`, the seed of each episode's random numbers, uint64 [e].
     Returns: (the experience, in the order of the episodes; RESULT [e]).
     Raises: ValueError if a time limit is out of range.
     """
@@ -409,8 +409,8 @@ def trajectory(
     """Drive one genome through one episode and record all states.
 
     Args: as `evaluate`'s; start, target and steps as in EPISODE, world float32 [cars, TRAFFIC_FIELDS].
-    Returns: (RESULT []; before each step and at the end, the states float32 [steps + 1, CAR_FIELDS], and the traffic
-    float32 [steps + 1, cars, TRAFFIC_FIELDS]).
+    Returns: (RESULT []; the car's states before each driven step and at the end, float32 [driven + 1, CAR_FIELDS]; the
+    traffic then, float32 [driven + 1, cars, TRAFFIC_FIELDS]).
     """
     simulation = simulations_on([road_map], config.drawn(start), spec.features)[0]
     cars = 0 if world is None else len(world)

@@ -1,7 +1,8 @@
 """Vector code for network layers, with sums held in registers.
 
-`tile` computes some positions times some units of a layer: the inputs of a position are `planes` x `rows` runs of `run`
-consecutive numbers, or in a dense layer a single run. It is emitted as LLVM vectors.
+`tile` makes a function that computes some units of a layer at some positions of the image; a dense layer has one
+position. The inputs of a position are `planes` x `rows` runs of `run` consecutive numbers; those of a dense layer are a
+single run. The function is emitted as LLVM vector code.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from numba.core.extending import intrinsic
 
 
 def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, optionally with ReLU.
+    """A function for kernels: biases plus weights times inputs, for `positions` x `lanes` (units); ReLU if `rectify`.
 
-    Its arguments: inputs x float32 [any], with the offset of the first position and the stride of positions, number and
-    stride of planes, number and stride of rows, and length of a run; weights w, their offset, the units of the whole
-    layer, and the offset of the biases; outputs y, their offset and the stride of positions. The inputs of each run are
-    summed in `chains` independent parts, which hides the latency of additions where there are few lanes and positions;
-    the order of sums is the same on any machine.
+    Its arguments are float32 arrays of any length, offsets in them and strides: inputs `x`, the first position `x_at`
+    and the stride `x_step` of positions; number and stride of planes, number and stride of rows, length `run` of a run;
+    weights `w` from `w_at` on, the units `width` of the whole layer, biases from `bias_at` on in `w`; outputs `y`,
+    `y_at` and `y_step`. Each run is summed in `chains` independent parts, which hides the latency of additions where
+    there are few lanes and positions; the order of sums is the same on any machine.
     """
 
     @intrinsic

@@ -1,8 +1,8 @@
 """Policies outside GridSim: as an ONNX graph from the environment's observations to its actions, n at a time.
 
 Inputs: `observation`, float32 [n, inputs]; on the grid `grid`, uint8 [n, frames, 80, 80], and `speed`, float32 [n, 1].
-Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the largest one; of
-continuous actions only `action`, float32 [n, 2], pedal and wheel, each within [-1, 1].
+Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the index of the
+largest one. With continuous actions only `action`, float32 [n, 2], pedal and wheel, each within [-1, 1].
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gridsim.sensing.grid import CELLS, FREE
 from gridsim.sensing.observation import FEATURES, SPEED_SCALE, encoding
 
 OPSET, IR_VERSION = 17, 8
-"""Versions of ONNX's operators and file format: of 2022, so that runtimes on small computers read it."""
+"""Versions of ONNX's operators and file format: of 2022, so that runtimes on small computers read the files."""
 
 
 def layers_of(spec: PolicySpec, genome: Any) -> list[tuple[Any, Any]]:
@@ -94,30 +94,30 @@ class _Graph:
         self.constants: dict[str, np.ndarray] = {}
 
     def constant(self, value: Any, dtype: type = np.float32) -> str:
-        """Name of a new constant."""
+        """Add a constant. Returns: its name."""
         name = f"c{len(self.constants)}"
         self.constants[name] = np.array(value, dtype=dtype, order="C")
         return name
 
     def add(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Name of the output of a new node."""
+        """Add a node. Returns: the name of its output, as the methods below do."""
         name = f"{kind.lower()}{len(self.nodes)}"
         self.nodes.append((kind, inputs, (name,), attributes))
         return name
 
     def horner(self, x: str, first: Any, *more: Any) -> str:
-        """Value of a polynomial, whose coefficients begin with that of the highest power."""
+        """Add a polynomial of x, whose coefficients begin with that of the highest power."""
         value = self.constant(first)
         for coefficient in more:
             value = self.add("Add", self.add("Mul", x, value), self.constant(coefficient))
         return value
 
     def dense(self, x: str, weights: np.ndarray, biases: np.ndarray) -> str:
-        """A dense layer, without its activation."""
+        """Add a dense layer, without its activation."""
         return self.add("Gemm", x, self.constant(weights), self.constant(biases))
 
     def squashed(self, x: str) -> str:
-        """The policies' hyperbolic tangent (`policy.squash`)."""
+        """Add the policies' hyperbolic tangent (`policy.squash`)."""
         x = self.add("Clip", x, self.constant(-4.97), self.constant(4.97))
         s = self.add("Mul", x, x)
         over = self.horner(s, 1.0, 378.0, 17325.0, 135135.0)
@@ -144,7 +144,7 @@ def _add_cnn(graph: _Graph, spec: CnnSpec, genome: np.ndarray, config: SimConfig
     one, two, _ = spec.hidden
     (w1, b1), (w2, b2), dense, last = layers_of(spec, genome)
     x = graph.add("Mul", graph.add("Cast", "grid", to=1), graph.constant(1.0 / 255.0))  # 1 is float32
-    # A genome orders a unit's inputs (frame, row, column), then (row, column, channel).
+    # A genome orders a unit's inputs (frame, row, column) in the first layer, (row, column, channel) in the second.
     w1 = w1.reshape(spec.frames, KERNEL_1, KERNEL_1, one).transpose(3, 0, 1, 2)
     w2 = w2.reshape(KERNEL_2, KERNEL_2, one, two).transpose(3, 2, 0, 1)
     for weights, biases, stride in ((w1, b1, STRIDE_1), (w2, b2, STRIDE_2)):

@@ -25,7 +25,7 @@ from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 RAYS = SensorConfig.rays
 ACTIONS = 8
 MAX_GENES = 1_000_000
-COMMAND_SCALE = 0.5  # scale of the genes that lead to pedal and wheel; with 1 both are at their limits mostly
+COMMAND_SCALE = 0.5  # scale of the genes of the outputs pedal and wheel; with 1 both are mostly at their limits
 
 _FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # regular expression of a specification's end
 
@@ -108,7 +108,8 @@ class PolicySpec(ABC):
 class MlpSpec(PolicySpec):
     """A multi-layer perceptron on rays, the speed, and other features: tanh hidden layers, linear outputs.
 
-    A network without memory cannot infer, for example, its own steering angle: the wheels take half a second to turn.
+    Other features show what a network without memory cannot infer, such as its own steering angle: the wheels take half
+    a second to turn.
     """
 
     observation = "rays"
@@ -179,7 +180,7 @@ class CnnSpec(PolicySpec):
 
 @cache
 def gene_scales(spec: PolicySpec) -> np.ndarray:
-    """The scale float32 [genes] of each gene: of the spread of new genomes and of mutations.
+    """The scale of each gene, float32 [genes]: the spread of new genomes and of mutations is proportional to it.
 
     1 for a perceptron, whose few inputs are alike, but COMMAND_SCALE in the layer of pedal and wheel. In a
     convolutional network, the standard deviation of He et al. (2015), sqrt(2 / inputs of the unit), so that a step has
@@ -259,7 +260,7 @@ def pack(genome, layers):
 
 @leaf
 def forward(packed, layers, scratch):
-    """Outputs of the network in scratch[return value: + outputs].
+    """Compute the network's outputs in `scratch`. Returns: the index at which they begin.
 
     Args: genome packed by `pack`; scratch float32 [2 * (widest layer + 8)], which begins with the inputs.
     A NaN anywhere reaches the outputs.
@@ -294,7 +295,7 @@ def forward(packed, layers, scratch):
 
 @leaf
 def greatest(values, first, n):
-    """Index of the greatest of n values from `first` on, the first one of ties; -1 if one is NaN."""
+    """Index of the greatest in `values[first:first + n]`, of equal ones the first; -1 if one is NaN."""
     best, index = values[first], 0
     number = best == best
     for k in range(1, n):
@@ -307,10 +308,10 @@ def greatest(values, first, n):
 
 @leaf
 def choose(outputs, first, n, command):
-    """The action that the n outputs from index `first` on stand for: the index of the largest; -1 if one is NaN.
+    """Choose an action from n outputs, `outputs[first:first + n]`.
 
-    With a command, float32 [2], there are two outputs, pedal and wheel. They are written there, each within [-1, 1];
-    the return value is then 0, or -1 if one is NaN.
+    Discrete (`command` is None): returns the index of the largest output, or -1 if one is NaN.
+    Continuous: writes pedal and wheel to `command`, float32 [2], each within [-1, 1]; returns 0, or -1 if one is NaN.
     """
     if command is None:
         return greatest(outputs, first, n)
@@ -348,10 +349,10 @@ def outputs_of(spec: MlpSpec, genome: np.ndarray, observations: np.ndarray, conf
 
 
 def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config: SimConfig) -> int | np.ndarray:
-    """Actions of a genome for the environment's observations, float32 [inputs] or [n, inputs] (`gridsim.envs.env`).
+    """Actions of a perceptron for the environment's observations, float32 [inputs] or [n, inputs] (`gridsim.envs.env`).
 
-    Returns: an action, or int64 [n], -1 if an output is NaN; or pedal and wheel, float32 [2] or [n, 2].
-    Raises: ValueError for a wrong shape.
+    Returns: for one observation an int or for n int64 [n], -1 where an output is NaN; if actions are continuous, pedal
+    and wheel, float32 [2] or [n, 2]. Raises: ValueError for a wrong shape, or a policy that is not a perceptron.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:

@@ -1,9 +1,9 @@
 """Left-right symmetry: which genes are free, and which are bound to them.
 
 Cars and roads look the same in a mirror. In a mirrored world a network should therefore take the mirrored action. It
-does so if each gene equals the gene of its mirror image, so random numbers are drawn for the free half of a genome, and
-the bound half copies them. The search then has half as many dimensions, and what is learned in a bend to the left also
-serves in a bend to the right.
+does so if each gene equals its mirror image, in some places with the opposite sign. So random numbers are drawn for the
+free half of a genome, and the bound half copies them. The search then has half as many dimensions, and what is learned
+in a bend to the left also serves in a bend to the right.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def space(spec: PolicySpec) -> Space:
 
 @cache
 def symmetry(spec: PolicySpec) -> Symmetry:
-    """The symmetry of a network in which hidden unit k of a layer mirrors unit k from its end.
+    """The symmetry of a network in which hidden unit k of a layer is the mirror image of unit k from the layer's end.
 
     With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
     all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
-    Factors are those of the features (`Feature.mirror`), -1 of weights to the wheel, elsewhere 1, and 0 for what would
-    be opposite to itself.
+    Factors are those of the features (`Feature.mirror`) in their weights, -1 in the genes of the wheel, else 1; and 0
+    for a gene that would be its own opposite.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
@@ -68,7 +68,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
 
 def _inputs(spec: PolicySpec) -> list[np.ndarray]:
-    """For each layer an array: at each input's index that of its mirror image."""
+    """For each layer an array of the indices of its inputs' mirror images."""
     if isinstance(spec, CnnSpec):
         first, second, dense = spec.hidden
         return [
@@ -82,6 +82,6 @@ def _inputs(spec: PolicySpec) -> list[np.ndarray]:
 
 
 def _columns_reversed(rows: int, columns: int, channels: int) -> np.ndarray:
-    """Indices [rows * columns * channels] of an image's values in the order of its mirror image."""
+    """Indices [rows * columns * channels] of an image's values with columns and channels in reverse order."""
     index = np.arange(rows * columns * channels).reshape(rows, columns, channels)
     return index[:, ::-1, ::-1].ravel()

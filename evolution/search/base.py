@@ -22,8 +22,8 @@ class SearchConfig:
     groups: int = 8  # of members; each group has its own episodes
     tournament: int = 4  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of the space's scales
-    # Where chance decides much, the generation from which the centre's steps shrink, with the square root of
-    # generations, and its average spans more of them: else chance undoes what was learned. 0: never.
+    # The generation from which the centre's steps shrink with the square root of generations, and its average spans
+    # more of them; 0: never. For tasks in which chance decides much, and would undo what was learned.
     settled: int = 0
     elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate
@@ -56,7 +56,7 @@ class Search(ABC):
         self.space, self.config, self.seed = space, config, seed
         self.generation = 0  # completed generations
         self.asked: Generation  # the current generation
-        self.champion: np.ndarray | None = None  # the run's, float32 [genes], for searches with it as an elite
+        self.champion: np.ndarray | None = None  # the run's so far, float32 [genes]; some searches keep it as an elite
 
     @abstractmethod
     def start_from(self, genome: np.ndarray) -> None:

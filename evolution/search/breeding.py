@@ -22,9 +22,9 @@ class Kind(IntEnum):
 
     COPY = 0  # parents[a], unmodified
     NEW = 1  # a random genome, symmetric (`space.Symmetry`), like the noise of STEP and MIRRORED
-    STEP = 2  # parents[a], and noise in each gene
-    MIRRORED = 3  # parents[a], less that noise: with the same seed, the opposite of a STEP
-    CROSS = 4  # uniform crossover of parents[a] and parents[b], then mutation of some genes; as symmetric as both are
+    STEP = 2  # parents[a] plus noise in each gene
+    MIRRORED = 3  # parents[a] minus the noise of a STEP with the same seed
+    CROSS = 4  # uniform crossover of parents[a] and parents[b], then mutation of some genes; symmetric if both are
 
 
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
@@ -74,7 +74,7 @@ def _normals(quantiles, stream, scale, symmetry, out):
 
 @njit
 def _cross(a, b, stream, threshold, source, child, marked):
-    """Uniform crossover, and marks of the genes to mutate, a bound gene as its source (`space.Symmetry`).
+    """Uniform crossover; marks the genes to mutate. Bound genes are chosen like their sources (`space.Symmetry`).
 
     Without branches, so that it is vectorised.
     """
@@ -87,7 +87,7 @@ def _cross(a, b, stream, threshold, source, child, marked):
 
 @njit(nogil=True)
 def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, children):
-    """Children of recipes; scales [genes] are the space's."""
+    """Fill `children` by recipes; scales [genes] and symmetry are the space's."""
     genes = children.shape[1]
     threshold = U(rate * F(1 << 24))
     marked = np.empty(genes, dtype=np.uint8)
