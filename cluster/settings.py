@@ -118,8 +118,8 @@ class RunSettings(ABC):
 
     @property
     def _sees_besides(self) -> str:
-        """End of the default policy: on several roads the speed limit tells a highway from a city."""
-        return "+limit" if len(self.crowds) > 1 else ""
+        """End of the default policy: on several roads the speed limit, and in traffic there, mirrors."""
+        return ("+limit" + "+mirrors" * any(self.crowds)) if len(self.crowds) > 1 else ""
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: it suits its roads, the car's size, and traffic if there is any."""
@@ -205,9 +205,10 @@ class EvolveSettings(RunSettings):
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
     +steering to see its own steering angle, +route to see where a route leads that it has to follow, +limit to see the
-    road's speed limit; by default mlp:64+steering, in traffic mlp:128+motion+steering, on several roads with +limit
-    (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of a dense layer and the
-    number of frames, by default cnn:8,16,32@1."""
+    road's speed limit, +mirrors to see how far behind other cars are on either side; by default mlp:64+steering, in
+    traffic mlp:128+motion+steering, on several roads with +limit, and +mirrors in traffic (the paper's is mlp:6,7). On
+    the grid cnn: with the channels of two convolutions, the units of a dense layer and the number of frames, by default
+    cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
     population: Annotated[int, IN_WORDS] = 0
@@ -304,8 +305,8 @@ class DqnSettings(RunSettings):
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network of the Q function: mlp: and the sizes of its hidden layers, and what else it sees as for gridsim-evolve,
-    by default mlp:64,64+steering, on several roads with +limit; on the grid cnn: with the channels of two
-    convolutions, the units of a dense layer and the number of frames, by default cnn:16,32,256@4."""
+    by default mlp:64,64+steering, on several roads with +limit, and +mirrors in traffic; on the grid cnn: with the
+    channels of two convolutions, the units of a dense layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
     """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""
     episodes: Annotated[int, IN_WORDS] = 0

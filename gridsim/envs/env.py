@@ -5,8 +5,9 @@ Observation:
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
   between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
   the steering angle as a share of 27 degrees, `route` four points of a route ahead, float32 [8]
-  (`gridsim.sensing.route`), and `limit` the road's speed limit as a share of 30 m/s. `gridsim.sensing.observation` has
-  these features.
+  (`gridsim.sensing.route`), `limit` the road's speed limit as a share of 30 m/s, and `mirrors` how far behind the next
+  cars are on the right and on the left, float32 [2], as shares of 20 m. These features are in
+  `gridsim.sensing.observation`.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.

@@ -15,6 +15,7 @@ import numpy as np
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, U, exact, freeze
 from gridsim.sensing import route
+from gridsim.sensing.mirrors import REACH, look_back
 from gridsim.sensing.route import AHEAD
 from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
@@ -47,13 +48,14 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
         Feature("route", len(AHEAD), ONE, ONE, mirror=-1.0, reversed=False, sees="a route to follow"),
         Feature("limit", 1, *speed, shift=-1.0, sees="the road's speed limit"),
+        Feature("mirrors", 2, REACH, F(4.0), near=True, least=F(0.0), sees="cars beside and behind"),
     )
 
 
 USUAL = constants(SimConfig())
 FEATURES = features(USUAL)
 OPTIONAL = tuple(dict.fromkeys(feature.name for feature in FEATURES if feature.sees))
-ROUTE = [feature.name for feature in FEATURES].index("route")
+ROUTE, MIRRORS = ([feature.name for feature in FEATURES].index(name) for name in ("route", "mirrors"))
 
 
 class Encoding(NamedTuple):
@@ -121,6 +123,10 @@ def observe(simulation, car, world, ranges, closing, observation):
         _put(encoding, ROUTE, values, observation)
         _put(encoding, ROUTE + 1, values[len(AHEAD) :], observation)
     _put(encoding, 6, (simulation.road.speed_high,), observation)
+    if sees(encoding, MIRRORS):
+        values = observation[encoding.first[MIRRORS] :]
+        look_back(simulation.road, simulation.constants, car, world, values)
+        _put(encoding, MIRRORS, values, observation)
 
 
 @exact

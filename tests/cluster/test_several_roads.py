@@ -55,9 +55,10 @@ def roads_of_episodes(episodes):
 
 
 def test_settings_of_several_roads_have_usual_traffic_and_the_network_for_it():
-    network = "mlp:128+motion+steering+limit"  # one driver has to tell a highway from a city
+    network = "mlp:128+motion+steering+limit+mirrors"  # one driver has to tell a highway from a city
     assert (SETTINGS.scenario, SETTINGS.traffic, SETTINGS.policy) == (",".join(ROADS), "usual", network)
-    assert DqnSettings("all").policy == "mlp:64,64+steering+limit"
+    assert DqnSettings("all").policy == "mlp:64,64+steering+limit+mirrors"
+    assert EvolveSettings("all", 0).policy == "mlp:64+steering+limit"
     alone = [EvolveSettings(road, "usual", population=64).curriculum() for road in ROADS]
     assert SETTINGS.curriculum().pace == tuple(each.pace[0] for each in alone)
     assert SETTINGS.curriculum().champion_pace == tuple(each.champion_pace[0] for each in alone)

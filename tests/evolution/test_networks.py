@@ -208,7 +208,11 @@ def in_a_mirror(spec, observations):
     seen[:, :RAYS] = observations[:, RAYS - 1 :: -1]
     if "motion" in spec.features:
         seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
-    first = spec.inputs - ("limit" in spec.features)
+    first = spec.inputs
+    if "mirrors" in spec.features:
+        seen[:, first - 2 : first] = observations[:, [-1, -2]]
+        first -= 2
+    first -= "limit" in spec.features
     if "route" in spec.features:  # points, how far ahead and then how far to the left
         seen[:, first - 4 : first] = -observations[:, first - 4 : first]
         first -= 8
@@ -301,7 +305,9 @@ def rays(spec):
 
 
 @CONFIGS
-@pytest.mark.parametrize("text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering+route"])
+@pytest.mark.parametrize(
+    "text", ["mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering+route+limit+mirrors"]
+)
 def test_perceptrons_give_the_kernels_outputs(text, config):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, MlpSpec)
@@ -331,7 +337,9 @@ def test_convolutional_networks_give_the_kernels_outputs(text, config):
 
 @CONFIGS
 @pytest.mark.parametrize("more", ["", "+continuous"])
-@pytest.mark.parametrize("text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering+route", "cnn:8,8,24@2"])
+@pytest.mark.parametrize(
+    "text", ["mlp:64+steering", "mlp:6,7+motion", "mlp:9,9+motion+steering+route+mirrors", "cnn:8,8,24@2"]
+)
 def test_a_champions_file_takes_what_the_environment_gives_and_acts_as_the_champion(text, more, config, tmp_path):
     text += more
     genome = np.random.default_rng(7).normal(0.0, 0.2, PolicySpec.parse(text).size).astype(F)

@@ -341,6 +341,27 @@ def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, s
     assert (simulator.closing[0][~met] == 0.0).all(), "the road's edge has no motion"
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.5])
+def test_mirrors_show_how_far_behind_the_next_cars_to_the_right_and_to_the_left_are(cross, heading):
+    """Places in the car's own frame: m ahead of its middle and m to its left; some are over the seam."""
+    start = np.array([[1.0, 128.0, heading, 6.0, 0.0]])
+    ahead, aside = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
+    shown = {
+        ((-9.0, -3.0), (-12.0, 3.0)): (5.0, 8.0),
+        ((-14.0, -3.0), (-9.0, -4.0)): (5.0, 20.0),  # the next one
+        ((-1.0, 2.3), (1.5, -2.3)): (0.0, 0.0),  # alongside
+        ((-9.0, 0.5), (-9.0, 6.0)): (20.0, 20.0),  # straight behind; two lanes away
+        ((3.0, 2.5), (-30.0, -3.0)): (20.0, 20.0),  # ahead, where rays are; too far
+    }
+    simulator = Simulator(1, CONFIG, traffic=2, features=("mirrors",))
+    for places, expected in shown.items():
+        poses = [(*(start[0, :2] + x * ahead + y * aside) % SIDE, heading + 0.1) for x, y in places]
+        simulator.reset(cross, start, worlds=parked(*poses)[None])
+        assert simulator.observations[0, -2:] * 20.0 == pytest.approx(expected, abs=1e-4), places
+    simulator.reset(cross, start)
+    assert (simulator.observations[0, -2:] == 1.0).all()
+
+
 @pytest.mark.parametrize("offset", [-2.8, 0.0, 2.8])
 def test_nothing_tunnels_through_crosswise(cross, offset):
     """Both at 30 m/s, at right angles, so that the middle of one is `offset` m short when that of the other crosses."""

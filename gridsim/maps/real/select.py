@@ -16,7 +16,7 @@ TURN = 1.75  # rad, 100 degrees: what may be turned within an arc of that radius
 NEARLY = 0.75  # of the largest component's length: components this long are kept, too
 APART = 2.5  # m of height between two ways, at least, if one passes above the other
 JOINT = 0.01  # m of the lanes before and after a lane that are looked at, for their directions
-END = 3.0  # m; lanes that cross within this + 8 m of an end meet there
+END = 11.0  # m; lanes that cross within this distance of an end meet there
 
 
 def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
@@ -125,7 +125,7 @@ def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_lin
     if not known or (one.junction == two.junction and one.junction):
         return ""
     at = one_line[i, :2]
-    if min(np.hypot(*(line[end, :2] - at)) for line in (one_line, other_line) for end in (0, -1)) < END + 8.0:
+    if min(np.hypot(*(line[end, :2] - at)) for line in (one_line, other_line) for end in (0, -1)) < END:
         return ""
     return min(key, other, key=lambda name: (road.lanes[name].speed, road.lanes[name].length))
 

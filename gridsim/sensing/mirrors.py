@@ -1,0 +1,29 @@
+"""What mirrors show: how far behind the next cars are to the right and to the left, where no ray reaches."""
+
+from __future__ import annotations
+
+from gridsim.jit import ZERO, F, exact
+from gridsim.maps.network import wrapped
+from gridsim.state import COS, LANE, SIN, X, Y
+
+REACH = F(20.0)  # m behind, as far as mirrors show cars
+ASIDE = F(5.5)  # m to either side, so that they show the next lane and not the one after it
+
+
+@exact
+def look_back(road, constants, car, world, gaps):
+    """Write the way (m) back to the next car on the right and on the left: gaps float32 [2].
+
+    It is 0 for a car alongside, and REACH if there is none. One straight behind is in neither mirror.
+    """
+    gaps[0] = gaps[1] = REACH
+    if world is not None:
+        length = F(2.0) * constants.half_length
+        for j in range(world.shape[0]):
+            if world[j, LANE] < ZERO:
+                continue
+            dx, dy = wrapped(world[j, X] - car[X], road.width), wrapped(world[j, Y] - car[Y], road.height)
+            forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+            if forward < constants.half_length and constants.half_width < abs(aside) < ASIDE:
+                side = 1 if aside > ZERO else 0
+                gaps[side] = min(gaps[side], max(-forward - length, ZERO))
