@@ -141,7 +141,7 @@ class RunSettings(ABC):
         )  # fmt: skip
 
     def extending(self, base: RunSettings) -> Self:
-        """These settings for a run of `base` that is continued: its limits may be raised."""
+        """These settings for continuing a run of `base`: a default limit is lifted if the user raised another one."""
         return self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:

@@ -66,8 +66,8 @@ class DqnConfig:
 def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
     """Share of random actions in each episode of a batch: float32 [episodes].
 
-    It falls from 1 to a share of the episode's own. Args: `epsilon`, the first episode's own share (later episodes have
-    smaller ones); `progress`, car-steps so far, divided by --anneal; `episodes`, their number.
+    In each episode it falls from 1 to that episode's own share. Args: `epsilon`, the first one's own share (later ones
+    have smaller ones); `progress`, car-steps so far, divided by --anneal; `episodes`, their number.
     """
     usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
     random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)
