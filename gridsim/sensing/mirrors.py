@@ -1,4 +1,4 @@
-"""What mirrors show: how far behind the next cars are to the right and to the left, where no ray reaches."""
+"""What mirrors show: how far behind the next cars that drive the same way are, to the right and to the left."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from gridsim.maps.network import wrapped
 from gridsim.state import COS, LANE, SIN, X, Y
 
 REACH = F(20.0)  # m behind, as far as mirrors show cars
+SAME_WAY = F(0.7)  # least cosine of the angle between the headings of cars that drive the same way
 ASIDE = F(5.5)  # m to either side, so that they show the next lane and not the one after it
 
 
@@ -14,7 +15,8 @@ ASIDE = F(5.5)  # m to either side, so that they show the next lane and not the 
 def look_back(road, constants, car, world, gaps):
     """Write the way (m) back to the next car on the right and on the left: gaps float32 [2].
 
-    It is 0 for a car alongside, and REACH if there is none. One straight behind is in neither mirror.
+    It is 0 for a car alongside, and REACH if there is none. A car straight behind is in neither mirror, nor is one that
+    comes the other way or from the side.
     """
     gaps[0] = gaps[1] = REACH
     if world is not None:
@@ -24,6 +26,7 @@ def look_back(road, constants, car, world, gaps):
                 continue
             dx, dy = wrapped(world[j, X] - car[X], road.width), wrapped(world[j, Y] - car[Y], road.height)
             forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-            if forward < constants.half_length and constants.half_width < abs(aside) < ASIDE:
+            same_way = car[COS] * world[j, COS] + car[SIN] * world[j, SIN] > SAME_WAY
+            if same_way and forward < constants.half_length and constants.half_width < abs(aside) < ASIDE:
                 side = 1 if aside > ZERO else 0
                 gaps[side] = min(gaps[side], max(-forward - length, ZERO))

@@ -346,16 +346,18 @@ def test_mirrors_show_how_far_behind_the_next_cars_to_the_right_and_to_the_left_
     """Places in the car's own frame: m ahead of its middle and m to its left; some are over the seam."""
     start = np.array([[1.0, 128.0, heading, 6.0, 0.0]])
     ahead, aside = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
-    shown = {
-        ((-9.0, -3.0), (-12.0, 3.0)): (5.0, 8.0),
-        ((-14.0, -3.0), (-9.0, -4.0)): (5.0, 20.0),  # the next one
-        ((-1.0, 2.3), (1.5, -2.3)): (0.0, 0.0),  # alongside
-        ((-9.0, 0.5), (-9.0, 6.0)): (20.0, 20.0),  # straight behind; two lanes away
-        ((3.0, 2.5), (-30.0, -3.0)): (20.0, 20.0),  # ahead, where rays are; too far
+    shown = {  # of two cars, and the angle of their headings to ours: ways back on the right and on the left
+        ((-9.0, -3.0), (-12.0, 3.0), 0.1): (5.0, 8.0),
+        ((-14.0, -3.0), (-9.0, -4.0), -0.7): (5.0, 20.0),  # the next one
+        ((-1.0, 2.3), (1.5, -2.3), 0.1): (0.0, 0.0),  # alongside
+        ((-9.0, 0.5), (-9.0, 6.0), 0.1): (20.0, 20.0),  # straight behind; two lanes away
+        ((3.0, 2.5), (-30.0, -3.0), 0.1): (20.0, 20.0),  # ahead, where rays are; too far
+        ((-9.0, -3.0), (-12.0, 3.0), 0.9): (20.0, 20.0),  # they come from the side
+        ((-9.0, -3.0), (-12.0, 3.0), math.pi): (20.0, 20.0),  # they drive the other way
     }
     simulator = Simulator(1, CONFIG, traffic=2, features=("mirrors",))
-    for places, expected in shown.items():
-        poses = [(*(start[0, :2] + x * ahead + y * aside) % SIDE, heading + 0.1) for x, y in places]
+    for (*places, turn), expected in shown.items():
+        poses = [(*(start[0, :2] + x * ahead + y * aside) % SIDE, heading + turn) for x, y in places]
         simulator.reset(cross, start, worlds=parked(*poses)[None])
         assert simulator.observations[0, -2:] * 20.0 == pytest.approx(expected, abs=1e-4), places
     simulator.reset(cross, start)
