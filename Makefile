@@ -40,7 +40,7 @@ test: $(DEV) ## Run the tests, in minutes; ARGS="tests/gridsim -k rays" are pass
 	$(BIN)/python -m pytest -n 2 -m "not e2e" $(ARGS)
 
 test-slow: $(DEV) ## Run the other tests: whole commands, real Ray workers, kills, hosts, images
-	$(BIN)/python -m pytest -n 3 --dist loadfile -m e2e --durations=30 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m e2e --durations=30 $(ARGS)
 
 ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
 	@$(BIN)/python -m cluster.commands.ui $(PORT)
@@ -49,7 +49,7 @@ bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/scaling.py
 
-results: $(DEV) ## Measure the tables of docs/results.md again, in two and a half hours; resumable
+results: $(DEV) ## Measure the tables of docs/results.md again, in some five hours; resumable
 	$(BIN)/python benchmarks/results.py --write $(ARGS)
 
 pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again
