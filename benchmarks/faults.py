@@ -47,7 +47,7 @@ SMALL = (  # but large enough to go on for some time after Ray is up
     "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "30", "--until", "2",
     "--seed", "5",
 )  # fmt: skip
-PATIENCE_S = 20  # after which a silent worker is replaced; Ray, too, must be up by then, on a busy machine
+PATIENCE_S = 10  # after which a silent worker is replaced
 WORKER = "ray::Actor"  # how the names of workers' processes begin
 MARK = "GRIDSIM_FAULTS"  # variable by which the processes of a campaign are found
 DISK_MIB, SHARED_MIB = 256, 6144  # each run's Ray looks for 768 MiB of shared memory

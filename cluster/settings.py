@@ -118,7 +118,7 @@ class RunSettings(ABC):
 
     @property
     def _sees_besides(self) -> str:
-        """End of the default policy: on several roads the speed limit, and in traffic there, mirrors."""
+        """End of the default policy: a driver of several roads sees the speed limit; in traffic it has mirrors, too."""
         return ("+limit" + "+mirrors" * any(self.crowds)) if len(self.crowds) > 1 else ""
 
     def curriculum(self) -> CurriculumConfig:

@@ -97,8 +97,8 @@ class Episodes:
 
     def _map(self, seed: int) -> Map:
         """The map with a seed, built if missing; it is kept if episodes are drawn from it."""
-        if seed not in self._own:
-            seed = seed_of_map(self.scenario, seed)  # looks at files
+        if seed not in self._own:  # `seed_of_map` looks at files, which would slow down each reset
+            seed = seed_of_map(self.scenario, seed)
         if seed in self._own:
             return self._own[seed]
         key = self.scenario, seed, self.config

@@ -12,13 +12,14 @@ ASIDE = F(5.5)  # m to either side, so that they show the next lane and not the 
 
 
 @exact
-def look_back(road, constants, car, world, gaps):
-    """Write the way (m) back to the next car on the right and on the left: gaps float32 [2].
+def read(simulation, car, world, ways):
+    """Write to `ways` float32 [2] how far behind (m) the next car on the right and the next one on the left are.
 
     It is 0 for a car alongside, and REACH if there is none. A car straight behind is in neither mirror, nor is one that
     comes the other way or from the side.
     """
-    gaps[0] = gaps[1] = REACH
+    road, constants = simulation.road, simulation.constants
+    ways[0] = ways[1] = REACH
     if world is not None:
         length = F(2.0) * constants.half_length
         for j in range(world.shape[0]):
@@ -29,4 +30,4 @@ def look_back(road, constants, car, world, gaps):
             same_way = car[COS] * world[j, COS] + car[SIN] * world[j, SIN] > SAME_WAY
             if same_way and forward < constants.half_length and constants.half_width < abs(aside) < ASIDE:
                 side = 1 if aside > ZERO else 0
-                gaps[side] = min(gaps[side], max(-forward - length, ZERO))
+                ways[side] = min(ways[side], max(-forward - length, ZERO))

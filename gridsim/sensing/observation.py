@@ -14,8 +14,7 @@ import numpy as np
 
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, U, exact, freeze
-from gridsim.sensing import route
-from gridsim.sensing.mirrors import REACH, look_back
+from gridsim.sensing import mirrors, route
 from gridsim.sensing.route import AHEAD
 from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
@@ -48,7 +47,7 @@ def features(k: Constants) -> tuple[Feature, ...]:
         Feature("route", len(AHEAD), ONE, ONE, shift=-1.0, reversed=False, sees="a route to follow"),
         Feature("route", len(AHEAD), ONE, ONE, mirror=-1.0, reversed=False, sees="a route to follow"),
         Feature("limit", 1, *speed, shift=-1.0, sees="the road's speed limit"),
-        Feature("mirrors", 2, REACH, F(4.0), near=True, least=F(0.0), sees="cars beside and behind"),
+        Feature("mirrors", 2, mirrors.REACH, F(4.0), near=True, least=F(0.0), sees="cars beside and behind"),
     )
 
 
@@ -125,7 +124,7 @@ def observe(simulation, car, world, ranges, closing, observation):
     _put(encoding, 6, (simulation.road.speed_high,), observation)
     if sees(encoding, MIRRORS):
         values = observation[encoding.first[MIRRORS] :]
-        look_back(simulation.road, simulation.constants, car, world, values)
+        mirrors.read(simulation, car, world, values)
         _put(encoding, MIRRORS, values, observation)
 
 
