@@ -27,8 +27,8 @@ class Loop(NamedTuple):
 
 ROOM = 4.2  # m from a narrow loop or a way round the world to lanes of other roads, at least
 NARROWEST = 3.5  # m, of such a loop or way
-# Tried in this order. A driver of generated roundabouts can turn in the second, and in the first also on a road whose
-# speed limit is higher; the third needs less room.
+# Tried in this order. Drivers of generated roundabouts can turn in a ring of the same size, but on roads with a higher
+# speed limit they come faster and need the wider first one. The last is for where there is little room.
 LOOPS = (Loop(RADIUS + 1.5, 2.0 * HALF_RING, 6.5), Loop(RADIUS, 2.0 * HALF_RING, 6.5), Loop(8.0, NARROWEST, ROOM))
 PARTNER = 45.0  # m between the end of a road and the beginning of the opposite direction, at most
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
