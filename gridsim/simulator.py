@@ -10,7 +10,7 @@ import numpy as np
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import NEUTRAL, Action, act, act_continuous
 from gridsim.config import SimConfig, constants
-from gridsim.jit import ZERO, F, I, njit
+from gridsim.jit import ZERO, F, I, leaf, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
 from gridsim.sensing.imperfections import History, imperfections_of, late_command
@@ -33,7 +33,7 @@ def _on_map(physics, row):
     return Simulation(road_of(physics[0], row), network_of(physics[0], row), *physics[1])
 
 
-@njit
+@leaf
 def _history_of(histories, i):
     """The History of car i; None without delays."""
     if histories is None:
@@ -41,17 +41,43 @@ def _history_of(histories, i):
     return History(histories[0][i], histories[1][i])
 
 
+@leaf
+def _look(simulation, i, cars, worlds, seen, histories):
+    """Have car i look around; args as in `_control_all`."""
+    ranges, closing, observations = seen
+    world = None if worlds is None else worlds[i]
+    look(simulation, cars[i], world, ranges[i], closing[i], observations[i], _history_of(histories, i))
+
+
+@leaf
+def _control(simulation, i, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
+    """One control period of car i; args as in `_control_all`."""
+    constants, car = simulation.constants, cars[i]
+    before, runs_on = car[DISTANCE], ends[i] == 0
+    if runs_on:
+        history = _history_of(histories, i)
+        if actions.ndim == 1:
+            action, _ = late_command(history, car, F(actions[i]), ZERO, NEUTRAL)
+            acceleration, steering = act(constants, I(action), car[SPEED], car[STEERING])
+        else:
+            pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
+            acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
+        world = None if worlds is None else worlds[i]
+        ends[i] = step(simulation, car, visits[i], world, acceleration, steering, *limits)
+    _look(simulation, i, cars, worlds, seen, histories)
+    if runs_on:
+        gained, fastest = car[DISTANCE] - before, simulation.road.speed_high
+        rewards[i] = reward(seen[0][i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
+
+
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, histories):
     """Put cars `which` [k] at `starts` [k, 5 or 8] and sense. Args as in `_control_all`; `order` indexes `which`."""
-    ranges, closing, observations = seen
     for row, first, last in runs:
         simulation = _on_map(physics, row)
         for k in order[first:last]:
-            i = which[k]
-            world = None if worlds is None else worlds[i]
-            place(simulation, starts[k], cars[i], visits[i])
-            look(simulation, cars[i], world, ranges[i], closing[i], observations[i], _history_of(histories, i))
+            place(simulation, starts[k], cars[which[k]], visits[which[k]])
+            _look(simulation, which[k], cars, worlds, seen, histories)
 
 
 @njit(nogil=True)
@@ -62,34 +88,17 @@ def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, vis
     and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
     Writes: `rewards` [n]; `seen`: ranges and closing speeds [n, rays], observations [n, values].
     """
-    ranges, closing, observations = seen
     for row, first, last in runs:
         simulation = _on_map(physics, row)
-        constants, fastest = simulation.constants, simulation.road.speed_high
         for i in order[first:last]:
-            car = cars[i]
-            world = None if worlds is None else worlds[i]
-            before = car[DISTANCE]
-            runs_on, history = ends[i] == 0, _history_of(histories, i)
-            if runs_on:
-                if actions.ndim == 1:
-                    action, _ = late_command(history, car, F(actions[i]), ZERO, NEUTRAL)
-                    acceleration, steering = act(constants, I(action), car[SPEED], car[STEERING])
-                else:
-                    pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
-                    acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-                ends[i] = step(simulation, car, visits[i], world, acceleration, steering, *limits)
-            look(simulation, car, world, ranges[i], closing[i], observations[i], history)
-            if runs_on:
-                gained = car[DISTANCE] - before
-                rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
+            _control(simulation, i, actions, limits, ends, rewards, cars, visits, worlds, seen, histories)
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cars sorted by their maps' rows [n] in the atlas: (order int64 [n], runs int64 [maps, 3]) of `_control_all`."""
-    order = np.argsort(rows, kind="stable")
-    names, first = np.unique(rows[order], return_index=True)
-    return order, np.stack([names, first, np.append(first[1:], len(rows))], axis=1).astype(np.int64)
+    cars = np.bincount(rows + 1)  # on each map; before its first reset, a car's row is -1
+    used, last = cars.nonzero()[0], cars.cumsum()
+    return rows.argsort(kind="stable"), np.stack([used - 1, (last - cars)[used], last[used]], axis=1)
 
 
 class Simulator:
