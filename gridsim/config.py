@@ -144,7 +144,8 @@ class TrafficConfig:
     spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars at the start of an episode, at least
     spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # between a car and the ego car at the start, at least
     courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind what stands this close is not idle
-    lights: bool = True  # whether there are traffic lights, where a file of a road has them
+    lights: bool = True  # whether there are traffic lights, where a road has them
+    city_lights: bool = False  # whether two streets of each `city` have some
 
 
 MOST_STEPS = 65_535  # control steps of an episode, at most
@@ -251,8 +252,9 @@ class SimConfig:
         vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
         if vehicle.model not in MODELS:
             raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {shown(vehicle.model)}")
-        if not isinstance(traffic.lights, bool):
-            raise GridSimError(f"traffic.lights must be true or false, not {shown(traffic.lights)}")
+        for name in ("lights", "city_lights"):
+            if not isinstance(value := getattr(traffic, name), bool):
+                raise GridSimError(f"traffic.{name} must be true or false, not {shown(value)}")
         if not vehicle.rear_axle < vehicle.wheelbase:
             text = f"below vehicle.wheelbase, {vehicle.wheelbase:g} m: the centre of mass lies between the axles"
             raise GridSimError(f"vehicle.rear_axle must be {text}, not {vehicle.rear_axle:g}")

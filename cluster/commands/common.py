@@ -102,7 +102,8 @@ class RoadFlags:
     scenario: Annotated[str, IN_WORDS] = ""
     """Road to drive on, or several, separated by commas, or all; by default as it learned."""
     sim: Annotated[str, IN_WORDS] = ""
-    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file; by default those it learned with."""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights, or a YAML file; by default as it
+    learned."""
     traffic: Annotated[Traffic, IN_WORDS] = -1
     """Other cars on the road: usual, heavy or a number; by default as many as it learned among, on another road as many
     as that has by default."""

@@ -89,7 +89,7 @@ class DriveFlags:
     example: ClassVar[str] = "gridsim-drive --scenario city --record drive.csv"
     scenario: Annotated[str, tyro.conf.arg(help=f"Road to drive on: {ROADS}")] = "seamless"
     sim: str = "default"
-    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights, or a YAML file (docs/own.md)."""
     traffic: Annotated[Traffic, IN_WORDS] = -1
     """Other cars on the road: usual, heavy or a number; by default as for gridsim-evolve."""
     record: Annotated[str, IN_WORDS] = ""

@@ -58,7 +58,7 @@ class Plan:
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
     sim: str = "default"
-    """Car, sensor and episode: default, f1tenth, sedan, truck, or a YAML file (docs/own.md)."""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights, or a YAML file (docs/own.md)."""
     traffic: Annotated[Traffic, IN_WORDS] = -1
     """Other cars on the road: usual, heavy or a number; by default as for gridsim-evolve."""
     population: Annotated[int, IN_WORDS] = 0

@@ -161,7 +161,8 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
         return with_seed(road_map, seed_of_map(name, seed), file == name)
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
-    strips, lanes = spec.layout(rng)
+    lit = config.traffic.lights and config.traffic.city_lights and config.unit == 1.0
+    strips, lanes = (spec.lit if spec.lit and lit else spec.layout)(rng)
     nodes = clearance_nodes(strips, float(lanes.width), float(lanes.height))
     road = make_road(nodes, speed_interval(name, config), spec.thinnest, config.unit)
     strips, lanes = strips.scaled(config.unit), lanes.scaled(config.unit)

@@ -8,11 +8,15 @@ from itertools import combinations, permutations
 
 import numpy as np
 
+from gridsim.jit import freeze
 from gridsim.maps.lanes import Path, Plan, lay_lanes
+from gridsim.maps.lights import CLEARING, GO, STOP
 from gridsim.maps.roads import Strips
 
 # Edges of a square in counter-clockwise order: east, north, west, south.
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+PHASES = np.repeat([GO, CLEARING, STOP], [12, 3, 9]).astype(np.uint8)  # what a light shows in each second
 
 Pieces = tuple[tuple[float, float], ...]  # length (m) and curvature (1/m) of each, as in `lanes.Path`
 
@@ -61,6 +65,9 @@ class Layout:
         self.arcs: list[list[float]] = []
         self.blocks: list[list[float]] = []
         self.paths: list[Path] = []
+        self.stop_lines: list[list[float]] = []
+        self.programs: list[np.ndarray] = []
+        self.signals: dict[int, int] = {}  # for lanes behind a stop line, its number
 
     def line(self, x: float, y: float, end_x: float, end_y: float) -> None:
         """Add a straight road between two points."""
@@ -95,6 +102,33 @@ class Layout:
             way = pieces((exit - entry) % 4, half, self.offset)
             self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
 
+    def signal(self, first: int, across: float, late: int) -> None:
+        """Put traffic lights in the middle of a straight street: its two lanes, paths `first` and the next, end there.
+
+        Args: `across`, half of the stop lines' length (m); `late`, s from the clock's beginning to that of PHASES.
+        """
+        for k in (first, first + 1):
+            (x, y, heading, ((length, _),)) = self.paths[k]
+            dx, dy, way = math.cos(heading), math.sin(heading), ((length / 2, 0.0),)
+            x_there, y_there = x + length / 2 * dx, y + length / 2 * dy
+            self.paths[k] = Path(x, y, heading, way)
+            self.signals[len(self.paths)] = len(self.programs)
+            self.paths.append(Path(x_there, y_there, heading, way))
+            self.stop_lines.append([x_there - self.offset * dy, y_there + self.offset * dx, dx, dy, across])
+            self.programs.append(np.roll(PHASES, late))
+
     def finish(self, side: float) -> Plan:
-        """The strips and lanes of a square map."""
-        return Strips.of(self.lines, self.arcs, self.blocks), lay_lanes(self.paths, side, side)
+        """The strips, and the lanes with their lights, of a square map."""
+        network = lay_lanes(self.paths, side, side)
+        if self.programs:
+            lines = np.array(self.stop_lines, dtype=np.float32)
+            lines[:, :2] %= np.float32(side)
+            signals = network.signals.copy()
+            signals[list(self.signals)] = list(self.signals.values())
+            network = network._replace(
+                lines=freeze(lines),
+                signals=freeze(signals),
+                program_offsets=freeze(np.cumsum([0, *map(len, self.programs)]).astype(np.int32)),
+                programs=freeze(np.concatenate(self.programs)),
+            )
+        return Strips.of(self.lines, self.arcs, self.blocks), network

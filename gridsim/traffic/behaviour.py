@@ -434,23 +434,22 @@ def step_traffic(network, drivers, world, ego):
         desired = _desired(network, car)
         pace = idm(drivers, car[s.SPEED], desired, car[s.GAP] - drivers.half_length, car[s.LEAD_SPEED])
         stops = lit and network.signals[U(onward)] >= 0 and light(network, network.signals[U(onward)], seconds) != GO
-        if stops and car[s.PERMIT] == car[s.NEXT]:
-            line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
-            if line > car[s.SPEED] * car[s.SPEED] / (F(2.0) * drivers.comfort):  # it can still stop
-                car[s.PERMIT] = -ONE
-        if is_junction(network, onward) and car[s.PERMIT] != car[s.NEXT]:
-            # Without a permit, stop at the line of the junction ahead.
-            line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
-            if line < car[s.HORIZON]:
-                if not stops and may_enter(network, drivers, world, i, ego, ego_way, seconds):
-                    car[s.PERMIT] = car[s.NEXT]
-                else:
-                    gap = line + drivers.jam - config.STOP_LINE_GAP
-                    pace = min(pace, idm(drivers, car[s.SPEED], desired, gap, ZERO))
-                    waits = is_junction(network, lane) and car[s.SPEED] < config.STANDING and not stops
-                    car[s.PERMIT] = car[s.PERMIT] - ONE if waits else -ONE
-                    if -car[s.PERMIT] * drivers.dt > config.GRIDLOCK:
-                        car[s.LANE] = -ONE
+        line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
+        can_stop = line > car[s.SPEED] * car[s.SPEED] / (F(2.0) * drivers.comfort)
+        if stops and can_stop and car[s.PERMIT] == car[s.NEXT]:
+            car[s.PERMIT] = -ONE
+        # Without a permit for the junction ahead, or at a light that is not green, stop at the line.
+        must_stop = car[s.PERMIT] != car[s.NEXT] if is_junction(network, onward) else stops and can_stop
+        if must_stop and line < car[s.HORIZON]:
+            if not stops and may_enter(network, drivers, world, i, ego, ego_way, seconds):
+                car[s.PERMIT] = car[s.NEXT]
+            else:
+                gap = line + drivers.jam - config.STOP_LINE_GAP
+                pace = min(pace, idm(drivers, car[s.SPEED], desired, gap, ZERO))
+                waits = is_junction(network, lane) and car[s.SPEED] < config.STANDING and not stops
+                car[s.PERMIT] = car[s.PERMIT] - ONE if waits else -ONE
+                if -car[s.PERMIT] * drivers.dt > config.GRIDLOCK:
+                    car[s.LANE] = -ONE
         car[s.ACCELERATION] = pace
     for i in range(cars):
         if world[i, s.LANE] >= ZERO:

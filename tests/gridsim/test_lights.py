@@ -1,4 +1,4 @@
-"""Traffic lights of real roads: their programs, what the ego car sees of them and must do, and that traffic obeys."""
+"""Traffic lights: their programs, what the ego car sees of them and must do, and that traffic obeys."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.lights import CLEARING, GO, STOP, programs_of_lines
 from gridsim.maps.real.lights import program
 from gridsim.maps.real.load import read_road
+from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
 from gridsim.state import CAR_FIELDS, CLOCK, COS, IDLE, LANE, SIN, START_FIELDS, End, X, Y
@@ -20,7 +21,7 @@ from gridsim.traffic.world import spawn
 from gridsim.view import paint
 from gridsim.view.render import Renderer
 
-SIM = SimConfig()
+SIM, LIT = SimConfig(), SimConfig.load("lights")
 CROSSING = [street((-120.0, 0.0), (0.0, 0.0), (120.0, 0.0)), street((0.0, -120.0), (0.0, 0.0), (0.0, 120.0))]
 
 
@@ -80,6 +81,39 @@ def test_lights_of_commonroad(tmp_path):
     assert (lanes["1"].light, lanes["2"].light) == ("", 20 * "r" + "r" + 30 * "g" + 3 * "y")
     path.write_text(commonroad([there, on], {1: [2]}, {1: 20}).replace(">300<", ">30<"))
     assert read_road(path).lanes["2"].light == 30 * "r" + 30 * "g" + 30 * "y"  # a cycle of 9 s would be too short
+
+
+def test_lights_of_the_city():
+    """In the middle of two streets, one each way; the line reaches across the road, and every lane there ends at it."""
+    for seed in range(8):
+        here = build("city", seed, LIT)
+        network, size = here.network, 256.0
+        assert len(network.lines) == 4
+        shows = programs_of_lines(network)
+        for one, other in ((0, 1), (2, 3)):
+            assert (shows[one] == shows[other]).all()
+            assert network.lines[one, 2:4] == pytest.approx(-network.lines[other, 2:4], abs=1e-6)
+        ends = network.points[network.offsets[1:] - 1]
+        for k, (x, y, cosine, sine, half) in enumerate(network.lines):
+            for side in (-half, half):
+                assert clearance(here.road, (x - side * sine) % size, (y + side * cosine) % size) < 0.0
+            lane = x + 1.5 * sine, y - 1.5 * cosine
+            away = (ends - lane + size / 2) % size - size / 2
+            before = np.flatnonzero(np.hypot(*away.T) < 0.01)
+            assert len(before) == 1
+            onward = network.successors[before[0]]
+            assert [network.signals[lane] for lane in onward if lane >= 0] == [k]
+        assert np.sort(network.signals[network.signals >= 0]).tolist() == [0, 1, 2, 3]
+
+
+def test_the_city_is_the_same_without_lights_and_a_small_car_meets_none():
+    here, without = build("city", 3, LIT), build("city", 3)
+    assert len(here.network.lines) > 0 == len(without.network.lines)
+    assert (here.road.field == without.road.field).all()
+    assert len(here.network.successors) == len(without.network.successors) + 4
+    for other in ({"lights": False}, {}):
+        off = SimConfig.of({"base": "lights" if other else "f1tenth", "traffic": {"city_lights": True, **other}})
+        assert len(build("city", 3, off).network.lines) == 0
 
 
 def test_rays_end_at_a_line_that_is_closed(crossing):
@@ -149,7 +183,9 @@ def driven(here, world, ego, steps):
     return np.array(lanes), np.array(shown)
 
 
-def test_traffic_obeys(crossing):
+@pytest.mark.parametrize("where", ["crossing", "city"])
+def test_traffic_obeys(crossing, where):
+    crossing = build("city", 3, LIT) if where == "city" else crossing
     nobody = np.zeros(CAR_FIELDS, dtype=np.float32)
     nobody[X] = np.inf
     world = spawn(crossing.network, np.full((1, 5), 1e6, np.float32), 12, np.zeros(1, np.uint64), SIM)[0]
@@ -179,8 +215,9 @@ def test_option_switches_them_off(file):
     off = SimConfig.of({"traffic": {"lights": False}})
     assert len(build(file, 0, off).network.lines) == 0
     assert SimConfig.of({"traffic": {"lights": True}}) == SIM
-    with pytest.raises(GridSimError, match=r"traffic\.lights must be true or false, not 'no'"):
-        SimConfig.of({"traffic": {"lights": "no"}})
+    for name in ("lights", "city_lights"):
+        with pytest.raises(GridSimError, match=rf"traffic\.{name} must be true or false, not 'no'"):
+            SimConfig.of({"traffic": {name: "no"}})
 
 
 def test_pictures_show_them(crossing):

@@ -1,18 +1,20 @@
 """The city: narrow irregular blocks on a torus, plain crossings with tight corners, parked cars in bays at the kerb.
 
 Streets run along the axes at irregular distances. Each street lacks one piece, which makes T junctions and bends. A bay
-widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes.
+widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes. With
+`traffic.city_lights` two streets have traffic lights in their middle, as where people cross.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from gridsim.maps.lanes import Path, Plan, Scenario
-from gridsim.maps.squares import DIRECTIONS, Layout, components
+from gridsim.maps.squares import DIRECTIONS, PHASES, Layout, components
 
 SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
@@ -30,6 +32,8 @@ CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
 CAR_SHARE = 0.7  # share of parking places that are taken
 CAR_SKEW = 0.05  # rad, at most, either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
+LIT = 2  # streets with traffic lights, if there are any
+LINE_OUT = 0.25  # m by which their stop lines reach beyond bays on either side
 
 
 def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray:
@@ -62,8 +66,8 @@ def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tup
         along += rng.uniform(*CAR_PITCH)
 
 
-def city_layout(rng: np.random.Generator) -> Plan:
-    """The strips and lanes of a random city."""
+def city_layout(rng: np.random.Generator, lit: int = 0) -> Plan:
+    """The strips and lanes of a random city; `lit`, the number of streets with traffic lights."""
     (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
     xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
     edges = street_graph(rng, columns, rows)
@@ -71,6 +75,7 @@ def city_layout(rng: np.random.Generator) -> Plan:
     half_road = rng.uniform(*HALF_ROAD)
     bay_half = half_road + BAY_DEPTH / 2  # the strip of a bay also covers the road
     layout = Layout(half_road, LANE_WIDTH)
+    streets: list[int] = []  # the first of each one's two lanes
 
     def street(x: float, y: float, d: int, length: float) -> None:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""
@@ -80,6 +85,7 @@ def city_layout(rng: np.random.Generator) -> Plan:
             return x + along * ux - left * uy, y + along * uy + left * ux
 
         layout.line(*place(0.0, 0.0), *place(length, 0.0))
+        streets.append(len(layout.paths))
         right, left = place(0.0, -LANE_WIDTH / 2), place(length, LANE_WIDTH / 2)
         layout.paths.append(Path(*right, heading, ((length, 0.0),)))
         layout.paths.append(Path(*left, heading + math.pi, ((length, 0.0),)))
@@ -106,7 +112,9 @@ def city_layout(rng: np.random.Generator) -> Plan:
             if edges[j, i, 1]:
                 gap = (ys[(j + 1) % rows] - y) % SIDE
                 street(x, y + half, 1, gap - half - corner[(j + 1) % rows, i])
+    for first in rng.choice(streets, lit, replace=False):
+        layout.signal(first, half_road + BAY_DEPTH + LINE_OUT, int(rng.integers(len(PHASES))))
     return layout.finish(SIDE)
 
 
-SCENARIO = Scenario(city_layout, (3.0, 10.0), traffic=6, thinnest=1.0)
+SCENARIO = Scenario(city_layout, (3.0, 10.0), traffic=6, thinnest=1.0, lit=partial(city_layout, lit=LIT))
