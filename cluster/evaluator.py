@@ -42,7 +42,7 @@ class Evaluator:
         scenario: str = "seamless",
         policy: str = "",
         traffic: Traffic = -1,
-        sim: SimConfig | str = "default",
+        sim: SimConfig | str = "",
         workers: int = 0,
         address: str | None = None,
         episodes: int = 16,
@@ -54,8 +54,8 @@ class Evaluator:
             scenario: a road's name, or a map file.
             policy: the network, as for --policy of gridsim-evolve, with the same default.
             traffic: other cars, usual, heavy or a number; -1 is as many as the road has by default.
-            sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these. A lower target
-                and time limit make an evaluation shorter.
+            sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these, by default as
+                for gridsim-evolve. A lower target and time limit make an evaluation shorter.
             workers, address: Ray workers, and a cluster's address; by default this process's threads.
             episodes: how many each genome drives.
             actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
@@ -71,7 +71,8 @@ class Evaluator:
         check_workers(workers, 0.0)
         if not 1 <= episodes <= MAX_EPISODES:
             raise GridSimError(f"episodes must be 1 to {MAX_EPISODES:,}, not {episodes}")
-        self._settings, self._sim, self._episodes = settings, SimConfig.load(sim), episodes
+        self._settings, self._episodes = settings, episodes
+        self._sim = settings.simulator() if isinstance(sim, str) else sim
         self.spec = PolicySpec.parse(settings.policy)
         self.genes: int = self.spec.size
         self._maps = Maps(settings.scenario, self._sim)

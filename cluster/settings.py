@@ -62,8 +62,8 @@ class RunSettings(ABC):
     """Other cars on the road: usual, heavy (twice as many) or a number. By default as each road has it (docs/roads.md),
     on several roads usual."""
     sim: Annotated[str, IN_WORDS] = ""
-    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights (the default, with traffic lights in
-    city) or a YAML file (docs/own.md). On several roads lights by default, if city is one of them."""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights (default with traffic lights in city) or
+    a YAML file (docs/own.md); by default lights where city is one of several roads, else default."""
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"

@@ -57,8 +57,9 @@ class Plan:
     budget: str = "60s"
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
-    sim: str = "default"
-    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights, or a YAML file (docs/own.md)."""
+    sim: Annotated[str, IN_WORDS] = ""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights, or a YAML file (docs/own.md); by
+    default as for gridsim-evolve."""
     traffic: Annotated[Traffic, IN_WORDS] = -1
     """Other cars on the road: usual, heavy or a number; by default as for gridsim-evolve."""
     population: Annotated[int, IN_WORDS] = 0

@@ -67,6 +67,12 @@ def test_settings_of_several_roads_have_usual_traffic_and_the_network_for_it():
     assert EvolveSettings("all", 0).traffic == 0 == EvolveSettings("all", sim="f1tenth").traffic
 
 
+def test_a_driver_of_several_roads_meets_lights_in_the_city():
+    sims = {roads: EvolveSettings(roads).sim for roads in ("all", "seamless,city", "seamless,curved", "city")}
+    assert sims == {"all": "lights", "seamless,city": "lights", "seamless,curved": "default", "city": "default"}
+    assert EvolveSettings("all", sim="default").sim == "default"
+
+
 def test_training_meets_all_roads_alike(learning):
     curriculum, config = learning.curriculum, learning.curriculum.config
     assert {road_of(SETTINGS.scenario, seed)[0] for seed in curriculum.map_seeds[: curriculum.maps_in_use(0)]} == {
