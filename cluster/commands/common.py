@@ -174,7 +174,7 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         if new == old or f.name in free or (f.name in may_grow and (new or math.inf) >= (old or math.inf)):
             continue
         new, old = (" ".join(value) if isinstance(value, tuple) else value for value in (new, old))
-        problem, remedy = f"contradicts the {what}'s {old}", "leave it out"
+        problem, remedy = f"contradicts the {what}'s {'default' if old == '' else old}", "leave it out"
         if f.name in may_grow:
             problem = problem if old else f"does not limit the {what}"
             remedy = f"give a greater {' or '.join(as_flag(name) for name in may_grow if getattr(before, name))}"
