@@ -62,8 +62,8 @@ class RunSettings(ABC):
     """Other cars on the road: usual, heavy (twice as many) or a number. By default as each road has it (docs/roads.md),
     on several roads usual."""
     sim: Annotated[str, IN_WORDS] = ""
-    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights (default with traffic lights in city) or
-    a YAML file (docs/own.md); by default lights where city is one of several roads, else default."""
+    """Car, sensor, episode and traffic: default, f1tenth, sedan, truck, lights (default, but city has traffic lights)
+    or a YAML file (docs/own.md); by default lights where city is one of several roads, else default."""
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"
@@ -84,8 +84,8 @@ class RunSettings(ABC):
     def __post_init__(self) -> None:
         object.__setattr__(self, "scenario", full_name(self.scenario))  # config.json may be read from another folder
         if not self.sim:
-            several = roads_of(self.scenario)
-            object.__setattr__(self, "sim", "lights" if len(several) > 1 and "city" in several else "default")
+            roads = roads_of(self.scenario)
+            object.__setattr__(self, "sim", "lights" if len(roads) > 1 and "city" in roads else "default")
         if names_file(self.sim):
             object.__setattr__(self, "sim", os.path.abspath(self.sim))
         cars = crowds(self.scenario, None if self.traffic == -1 else self.traffic, self.simulator())

@@ -18,7 +18,8 @@ _OUTLINE = np.array(
     dtype=np.float32,
 )
 _OUTLINE.setflags(write=False)
-_OUTLINE_STEP = F(0.1)  # m, least, from point to point beside thin walls; a corner may reach in by half of it
+# m between points of the outline beside thin walls, at least. A wall's corner may reach in by half of it.
+_OUTLINE_STEP = F(0.1)
 
 
 @leaf

@@ -145,7 +145,7 @@ class TrafficConfig:
     spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # between a car and the ego car at the start, at least
     courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind what stands this close is not idle
     lights: bool = True  # whether there are traffic lights, where a road has them
-    city_lights: bool = False  # whether two streets of each `city` have some
+    city_lights: bool = False  # whether two streets of each `city` have traffic lights
 
 
 MOST_STEPS = 65_535  # control steps of an episode, at most

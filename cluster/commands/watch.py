@@ -245,7 +245,7 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     sims = [each.drive.sim for each in shown]
     if len({(sim.vehicle, sim.traffic.lights, sim.traffic.city_lights) for sim in sims}) > 1:
-        raise GridSimError("a page shows one kind of car, with or without traffic lights; give --sim")
+        raise GridSimError("a page shows one kind of car, either with traffic lights or without; give --sim")
     title = f"GridSim: {', '.join(sources)} on {shown[0].drive.scenario.name}"
     write_page(output, title, shown, together=bool(flags.beside))
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")

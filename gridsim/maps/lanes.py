@@ -31,7 +31,7 @@ class Scenario(NamedTuple):
     traffic: int = 0  # default number of other cars
     usual_traffic: int = 6  # the number that `usual` means, if the default is 0
     thinnest: float = THICK_WALL  # m, of its walls and parked cars
-    lit: Callable[[np.random.Generator], Plan] | None = None  # the layout with `traffic.city_lights`
+    lit: Callable[[np.random.Generator], Plan] | None = None  # its layout with lights, for `traffic.city_lights`
 
 
 LANE_STEP = 1.0  # m between points of a lane, at most

@@ -8,12 +8,14 @@ drives.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gridsim.counter import mix
-from gridsim.jit import ZERO, F, I, U, leaf
+from gridsim.jit import ZERO, F, I, U, freeze, leaf
 from gridsim.maps.network import Network, wrapped, wrapped_any
 from gridsim.state import CLOCK, COS, POSE, SIN, X, Y
 
@@ -21,14 +23,23 @@ GO, CLEARING, STOP = 0, 1, 2  # green; yellow: those who cannot stop any more ma
 NO_LINE = F(1e9)  # m, the way to a stop line where there is none
 
 
+def lights_of(signals: ArrayLike, lines: ArrayLike, programs: Sequence[Sequence[int]]) -> dict[str, Any]:
+    """The fields of a Network that hold its lights.
+
+    Args: `signals` [lanes], the number of the program by which cars enter a lane, or -1; `lines` [lines, 5]; what each
+    of the `programs` shows in each second, of which the first are those of the lines.
+    """
+    return {
+        "lines": freeze(np.array(lines, dtype=np.float32).reshape(-1, 5)),
+        "signals": freeze(np.array(signals, dtype=np.int32)),
+        "program_offsets": freeze(np.cumsum([0, *map(len, programs)]).astype(np.int32)),
+        "programs": freeze(np.array([shows for program in programs for shows in program], dtype=np.uint8)),
+    }
+
+
 def no_lights(lanes: int) -> dict[str, Any]:
     """The fields of a Network with this number of lanes that hold its lights: none."""
-    return {
-        "lines": np.zeros((0, 5), dtype=np.float32),
-        "signals": np.full(lanes, -1, dtype=np.int32),
-        "program_offsets": np.zeros(1, dtype=np.int32),
-        "programs": np.zeros(0, dtype=np.uint8),
-    }
+    return lights_of(np.full(lanes, -1), [], [])
 
 
 def programs_of_lines(network: Network) -> list[np.ndarray]:

@@ -145,7 +145,8 @@ def _interval_of_files(name: str, _digest: str, config: SimConfig) -> tuple[floa
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`).
+    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`), and there are
+    neither traffic nor lights.
     """
     config = config or SimConfig()
     check_name(name)

@@ -8,15 +8,14 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from gridsim.jit import freeze
 from gridsim.maps.lanes import Path, Plan, lay_lanes
-from gridsim.maps.lights import CLEARING, GO, STOP
+from gridsim.maps.lights import CLEARING, GO, STOP, lights_of
 from gridsim.maps.roads import Strips
 
 # Edges of a square in counter-clockwise order: east, north, west, south.
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
-PHASES = np.repeat([GO, CLEARING, STOP], [12, 3, 9]).astype(np.uint8)  # what a light shows in each second
+PHASES = np.repeat([GO, CLEARING, STOP], [12, 3, 9])  # what a light shows in each second of its cycle
 
 Pieces = tuple[tuple[float, float], ...]  # length (m) and curvature (1/m) of each, as in `lanes.Path`
 
@@ -66,8 +65,8 @@ class Layout:
         self.blocks: list[list[float]] = []
         self.paths: list[Path] = []
         self.stop_lines: list[list[float]] = []
-        self.programs: list[np.ndarray] = []
-        self.signals: dict[int, int] = {}  # for lanes behind a stop line, its number
+        self.programs: list[list[int]] = []  # what the light of each stop line shows in each second
+        self.signals: dict[int, int] = {}  # the number of the stop line by which cars enter a lane
 
     def line(self, x: float, y: float, end_x: float, end_y: float) -> None:
         """Add a straight road between two points."""
@@ -103,9 +102,10 @@ class Layout:
             self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
 
     def signal(self, first: int, across: float, late: int) -> None:
-        """Put traffic lights in the middle of a straight street: its two lanes, paths `first` and the next, end there.
+        """Put traffic lights in the middle of a straight street and split its lanes, paths `first` and the next, there.
 
-        Args: `across`, half of the stop lines' length (m); `late`, s from the clock's beginning to that of PHASES.
+        Args: `across`, half of a stop line's length (m); `late`, seconds by which the lights' cycle begins after their
+        clock.
         """
         for k in (first, first + 1):
             (x, y, heading, ((length, _),)) = self.paths[k]
@@ -115,20 +115,13 @@ class Layout:
             self.signals[len(self.paths)] = len(self.programs)
             self.paths.append(Path(x_there, y_there, heading, way))
             self.stop_lines.append([x_there - self.offset * dy, y_there + self.offset * dx, dx, dy, across])
-            self.programs.append(np.roll(PHASES, late))
+            self.programs.append(np.roll(PHASES, late).tolist())
 
     def finish(self, side: float) -> Plan:
         """The strips, and the lanes with their lights, of a square map."""
         network = lay_lanes(self.paths, side, side)
-        if self.programs:
-            lines = np.array(self.stop_lines, dtype=np.float32)
-            lines[:, :2] %= np.float32(side)
-            signals = network.signals.copy()
-            signals[list(self.signals)] = list(self.signals.values())
-            network = network._replace(
-                lines=freeze(lines),
-                signals=freeze(signals),
-                program_offsets=freeze(np.cumsum([0, *map(len, self.programs)]).astype(np.int32)),
-                programs=freeze(np.concatenate(self.programs)),
-            )
+        signals = [self.signals.get(lane, -1) for lane in range(len(self.paths))]
+        lines = np.array(self.stop_lines, dtype=np.float32).reshape(-1, 5)
+        lines[:, :2] %= np.float32(side)
+        network = network._replace(**lights_of(signals, lines, self.programs))
         return Strips.of(self.lines, self.arcs, self.blocks), network

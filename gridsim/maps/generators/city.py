@@ -33,7 +33,7 @@ CAR_SHARE = 0.7  # share of parking places that are taken
 CAR_SKEW = 0.05  # rad, at most, either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
 LIT = 2  # streets with traffic lights, if there are any
-LINE_OUT = 0.25  # m by which their stop lines reach beyond bays on either side
+LINE_OUT = 0.25  # m by which stop lines reach beyond the bays on either side
 
 
 def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray:
@@ -75,7 +75,7 @@ def city_layout(rng: np.random.Generator, lit: int = 0) -> Plan:
     half_road = rng.uniform(*HALF_ROAD)
     bay_half = half_road + BAY_DEPTH / 2  # the strip of a bay also covers the road
     layout = Layout(half_road, LANE_WIDTH)
-    streets: list[int] = []  # the first of each one's two lanes
+    streets: list[int] = []  # for each street, the number of the first of its two lanes
 
     def street(x: float, y: float, d: int, length: float) -> None:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""

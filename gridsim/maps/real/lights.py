@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gridsim.jit import freeze
-from gridsim.maps.lights import CLEARING, GO, STOP
+from gridsim.maps.lights import CLEARING, GO, STOP, lights_of
 from gridsim.maps.network import Network
 from gridsim.maps.real.description import Lane
 from gridsim.maps.roads import Road, clearances
@@ -54,13 +54,8 @@ def with_lights(network: Network, lanes: dict[str, Lane], road: Road) -> Network
     own = sorted(set(light) - {""})
     programs += own
     signals = [own.index(text) + len(lines) if text else -1 for text in light]
-    shown = [SHOWS[colour] for text in programs for colour in text]
-    return network._replace(
-        lines=freeze(np.array(lines, dtype=np.float32).reshape(-1, 5)),
-        signals=freeze(np.array(signals, dtype=np.int32)),
-        program_offsets=freeze(np.cumsum([0, *map(len, programs)]).astype(np.int32)),
-        programs=freeze(np.array(shown, dtype=np.uint8)),
-    )
+    shown = [[SHOWS[colour] for colour in text] for text in programs]
+    return network._replace(**lights_of(signals, lines, shown))
 
 
 def _together(lights: list[str]) -> str:
