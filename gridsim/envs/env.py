@@ -39,7 +39,7 @@ from gymnasium.vector.utils import batch_space
 
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
-from gridsim.envs.episodes import Episodes
+from gridsim.envs.draws import Draws
 from gridsim.envs.observing import Observer, row
 from gridsim.jit import U
 from gridsim.maps.map import Map
@@ -138,7 +138,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             "autoreset_mode": self.autoreset_mode,
         }
         self.simulator = Simulator(num_envs, self.config, None, max_episode_steps, max(cars), seen)
-        self._episodes = Episodes(num_envs, scenario, maps, map_seed, cars, self.config)
+        self._draws = Draws(num_envs, scenario, maps, map_seed, cars, self.config)
         self.render_mode = render_mode
         self._views: dict[Map, Renderer] = {}
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
@@ -215,7 +215,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def _seed(self, seed: int | np.integer | Sequence[int | None] | None, which: np.ndarray) -> None:
         """Seed cars `which`, or let them go on to their next episodes."""
-        n, episodes = self.num_envs, self._episodes
+        n, draws = self.num_envs, self._draws
         seeds: list[Any] = (
             list(seed) if np.iterable(seed) else [int(seed) + i if _is_seed(seed) else seed for i in range(n)]
         )
@@ -224,24 +224,24 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if not np.iterable(seed):
             super().reset(seed=seeds[0])
         if self._seeded:
-            episodes.numbers[which] += U(1)
+            draws.numbers[which] += U(1)
         else:
-            episodes.keys[:] = U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
+            draws.keys[:] = U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
             self._seeded = True
         for i in which:
             if seeds[i] is not None:
-                episodes.keys[i], episodes.numbers[i] = int(seeds[i]) % (1 << 64), 0
+                draws.keys[i], draws.numbers[i] = int(seeds[i]) % (1 << 64), 0
 
     def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> None:
         """Begin the current episodes of cars `which`."""
-        maps, starts, worlds = self._episodes.draw(which, map_seed, start)
+        maps, starts, worlds = self._draws.draw(which, map_seed, start)
         if map_seed is not None and len(which) == self.num_envs:
             self.simulator.forget_maps()
         self.simulator.reset(maps, starts, which, worlds)
 
     def _begin_next(self, which: np.ndarray) -> None:
         """Begin the next episodes of cars `which`."""
-        self._episodes.numbers[which] += U(1)
+        self._draws.numbers[which] += U(1)
         self._begin(which)
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The episodes of cars: map, start and traffic depend only on a car's seed and the episode's number."""
+"""How the episodes of cars are drawn: map, start and traffic depend only on a car's seed and the episode's number."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def _draw(keys, episodes, which, numbers, drawn):
             numbers[k, j] = uniform64(mix(episode + U(j + 1) * GOLDEN))
 
 
-class Episodes:
-    """The episodes of a batch of cars.
+class Draws:
+    """What decides the episodes of a batch of cars.
 
     Attributes:
         keys: uint64 [n], each car's seed.
@@ -45,7 +45,7 @@ class Episodes:
         self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, crowds: tuple[int, ...],
         config: SimConfig,
     ):  # fmt: skip
-        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed.
+        """Draw from these `maps`, or from that many from `map_seed` on, built when first needed.
 
         Args: other cars on each of the scenario's roads.
         """
