@@ -14,11 +14,13 @@ import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numba
 import numpy as np
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+from numba.core.registry import CPUDispatcher
 
 from gridsim.cache import cache_folder
 from gridsim.errors import GridSimError
@@ -112,25 +114,49 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     before = CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES
     CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = str(CACHE_FOLDER), f"{__name__}.{CacheLocator.__name__}"
     try:
-        kernel = numba.njit(**{"error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
+        given = {"error_model": "numpy", "fastmath": FAST_MATH, "no_cfunc_wrapper": True, **options}
+        kernel = numba.njit(**given)(function)
         kernel._cache = KernelCache(function)  # as `cache=True` does with Numba's own
         return kernel
     finally:
         CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = before
 
 
-def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
+class Leaf(CPUDispatcher):
+    """A kernel that other kernels inline.
+
+    It lacks the code that would take its arguments, a road's being some two hundred, from Python's objects: for all
+    leaves, that is a third of the time that a run's kernels take to compile. When Python first calls it, it is
+    compiled once more, with that code.
+    """
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.for_python(*arguments)
+
+    @functools.cached_property
+    def for_python(self) -> Callable[..., Any]:
+        """The kernel that Python can call."""
+        f = self.py_func
+        copy = FunctionType(f.__code__, f.__globals__, closure=f.__closure__)
+        copy.__qualname__ += " for Python"  # by which Numba names its files
+        return njit(copy, fastmath=self.targetoptions["fastmath"])
+
+
+def leaf(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`njit` for small kernels that return only numbers: inlined into their callers, without reference counting.
 
-    Otherwise, passing a road and its constants (some 60 arguments) would take a third of a step's time. Do not use it
-    for a kernel that returns or stores an array.
+    Otherwise, passing a road and its constants (some two hundred arguments) would take a third of a step's time. Do not
+    use it for a kernel that returns or stores an array.
     """
-    return njit(function, forceinline=True, _nrt=False)
+    kernel = njit(function, forceinline=True, _nrt=False, no_cpython_wrapper=True, **options)
+    if isinstance(kernel, CPUDispatcher):  # else Numba is told to compile nothing
+        kernel.__class__ = Leaf
+    return kernel
 
 
 def exact(function: Callable[..., Any]) -> Callable[..., Any]:
     """A `leaf` without `fastmath`: it rounds the same in every kernel that inlines it, and as NumPy does."""
-    return njit(function, forceinline=True, _nrt=False, fastmath=False)
+    return leaf(function, fastmath=False)
 
 
 def freeze(array: np.ndarray) -> np.ndarray:

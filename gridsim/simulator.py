@@ -260,6 +260,12 @@ class Simulator:
         return rewards
 
 
+@njit
+def _views(simulation, cars, worlds, closing, ranges, observations):
+    for i in range(cars.shape[0]):
+        look(simulation, cars[i], worlds[i], ranges[i], closing, observations[i], None)
+
+
 def views(
     scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig, features: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -271,8 +277,7 @@ def views(
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     observations = np.empty((len(cars), simulation.encoding.first[-1]), dtype=np.float32)
     closing = np.zeros(config.sensors.rays * ("motion" in features), dtype=np.float32)
-    for car, world, row, observation in zip(cars, worlds, ranges, observations, strict=True):
-        look(simulation, car, world, row, closing, observation, None)
+    _views(simulation, cars, worlds, closing, ranges, observations)
     return ranges, observations
 
 

@@ -35,6 +35,7 @@ from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import REGISTRY, build, label, traffic_on
 from gridsim.sensing.imperfections import imperfections_of
 from gridsim.simulator import views
+from gridsim.state import CAR_FIELDS
 from gridsim.traffic.world import spawn
 
 OWN = "fitness"  # in names of markers and on command lines: the run has a fitness of the user's own
@@ -62,7 +63,7 @@ def has_own(settings: RunSettings) -> bool:
 
 
 def is_compiled(settings: RunSettings) -> bool:
-    """Whether the cache has all kernels that a run needs; else `compile_ahead` takes half a minute."""
+    """Whether the cache has all kernels that a run needs; else `compile_ahead` takes some 20 s."""
     return _marker(settings).exists()
 
 
@@ -104,9 +105,11 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
     for seed in range(len(roads_of(scenario))):
         built = build(scenario, seed, config)
         spawn(built.network, sample_starts(built, 1, np.random.default_rng(0)), traffic, keys, config)
-    _, cars, others = trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
-    views(road, cars, others, config)
+    cars = np.zeros((1, CAR_FIELDS), dtype=np.float32)
+    views(road, cars, worlds, config, spec.features)
     clearances(road.road, freeze(cars[:, :2]))
+    # Last, as the other part has compiled most of it by now.
+    trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
 
 
 def everything_by_default() -> list[RunSettings]:

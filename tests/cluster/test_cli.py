@@ -25,7 +25,7 @@ from gridsim.config import SimConfig
 
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]
-GENERATIONS = 60  # some seconds: a run is saved once a second, and is to be met while it learns
+GENERATIONS = 40  # some seconds: a run is saved once a second, and is to be met while it learns
 SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5"]
 REFERENCE = ("gridsim-evolve", *SMALL)
 

@@ -16,7 +16,7 @@ from commands import BIN, finish, rows, running, same_run, wait_until
 
 from gridsim.jit import CACHE_FOLDER
 
-SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "60", "--seed", "5"]
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "30", "--seed", "5"]
 REFERENCE = ("gridsim-evolve", *SMALL)
 pytestmark = pytest.mark.e2e
 
@@ -41,7 +41,7 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(reference: Path, tmp_path:
     assert process.returncode == 130
     (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
     assert logged.status == "KILLED"
-    assert len(rows(run)) < 60
+    assert len(rows(run)) < 30
     finish("gridsim-evolve", "--workers", "0", "--resume", "runs/r", cwd=tmp_path)
     assert same_run(run, reference)
 

@@ -28,7 +28,7 @@ byte = 150  # of clearance at every node: 2.69 m above the floor of -2 m
 word = byte * 0x01010101
 road = roads.Road(jit.freeze(np.full(64, word, dtype=u)), u(8), u(8), f(4), f(4), f(5), f(12), f(1), f(1), f(1), f(1))
 hit = collision.collides(road, constants(SimConfig()), f(1), f(1), f(1), f(0))
-hits = sum(collision.collides.stats.cache_hits.values())
+hits = sum(collision.collides.for_python.stats.cache_hits.values())
 print(json.dumps({"file": roads.__file__, "folder": str(jit.CACHE_FOLDER), "hit": bool(hit), "from_cache": hits}))
 """
 
