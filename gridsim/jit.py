@@ -137,7 +137,7 @@ class Leaf(CPUDispatcher):
     def for_python(self) -> Callable[..., Any]:
         """The kernel that Python can call."""
         f = self.py_func
-        copy = FunctionType(f.__code__, f.__globals__, closure=f.__closure__)
+        copy = FunctionType(f.__code__, f.__globals__, argdefs=f.__defaults__, closure=f.__closure__)
         copy.__qualname__ += " for Python"  # by which Numba names its files
         return njit(copy, fastmath=self.targetoptions["fastmath"])
 

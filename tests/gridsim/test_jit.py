@@ -9,6 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numba
+import numpy as np
 import pytest
 from commands import finish
 
@@ -87,6 +89,32 @@ def test_an_edited_kernel_is_compiled_anew_and_a_copy_elsewhere_is_not(root, tmp
     edited = call(copy)
     assert edited["folder"] != first["folder"]
     assert (edited["hit"], edited["from_cache"]) == (True, 0)
+
+
+# --- what kernels inline
+
+
+def _product_less(x, y, by=jit.ONE):
+    return x * y - by
+
+
+@pytest.mark.parametrize("kind", [jit.leaf, jit.exact])
+def test_python_calls_what_kernels_inline_before_and_after_they_do(kind, tmp_path, monkeypatch):
+    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
+    x, y = np.random.default_rng(0).uniform(1.0, 2.0, (2, 1000)).astype(np.float32)
+    for _ in range(2):  # compiled, and from the cache
+        inlined: Any = kind(_product_less)
+        called: Any = kind(_product_less)
+
+        @numba.njit
+        def kernel(x, y, inlined=inlined):
+            return inlined(x, y)
+
+        first = [called(*each) for each in zip(x, y, strict=True)]
+        in_kernel = [kernel(*each) for each in zip(x, y, strict=True)]
+        assert first == in_kernel == [inlined(*each) for each in zip(x, y, strict=True)]
+        # Contraction to one rounding is what `exact` forbids.
+        assert (first == [_product_less(*each) for each in zip(x, y, strict=True)]) == (kind is jit.exact)
 
 
 # --- which folder
