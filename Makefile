@@ -37,7 +37,7 @@ compare: $(STAMP) ## Compare the learners on all roads, up to an hour; ARGS=--qu
 	@$(BIN)/gridsim-compare $(ARGS)
 
 test: $(DEV) ## Run the tests, in minutes; ARGS="tests/gridsim -k rays" are passed on to pytest
-	$(BIN)/python -m pytest -n 2 -m "not e2e" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not e2e" $(ARGS)
 
 test-slow: $(DEV) ## Run the other tests: whole commands, real Ray workers, kills, hosts, images
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m e2e --durations=30 $(ARGS)
