@@ -37,7 +37,7 @@ EPISODES = 1024  # held-out drives of each champion
 SEEDS, SEEDS_IN_TRAFFIC = 5, 3
 BUDGETS = ("--car-steps 15e6", "--compute 1", "--compute 4")
 GOOD = 0.95  # of validation
-NONE = 0.5  # where no failure at all is drawn on a logarithmic axis
+NO_FAILURES = 0.5  # a run without failures is drawn at this height of the logarithmic axis
 ROADS = (
     ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
     ("highway", 8),
@@ -258,14 +258,14 @@ def draw_compute(rows: Mapping[str, Sequence[str]], store: Store, path: Path) ->
             if not runs:
                 continue
             million = [run["car_steps"] / 1e6 for run in runs]
-            failures = [EPISODES * (1.0 - run["held_out"]["success_rate"]) or NONE for run in runs]
+            failures = [EPISODES * (1.0 - run["held_out"]["success_rate"]) or NO_FAILURES for run in runs]
             axes.plot(million, failures, ".", color=f"C{k}")
             medians.append((statistics.median(million), statistics.median(failures)))
         axes.plot(*zip(*medians, strict=True), color=f"C{k}", label=road)
     axes.set(xscale="log", yscale="log", xlabel="million car-steps", ylabel=f"failures of {EPISODES:,} held-out drives")
     axes.set_xticks([15, 60, 240, 960], ["15", "60", "240", "960"])
     axes.minorticks_off()
-    axes.set_yticks([NONE, *(ticks := (1, 2, 5, 10, 20, 50, 100, 200, 500))], ["none", *map(str, ticks)])
+    axes.set_yticks([NO_FAILURES, *(ticks := (1, 2, 5, 10, 20, 50, 100, 200, 500))], ["none", *map(str, ticks)])
     axes.grid(alpha=0.25)
     axes.legend()
     figure.savefig(path, dpi=110)

@@ -125,9 +125,9 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
 class Leaf(CPUDispatcher):
     """A kernel that other kernels inline.
 
-    It lacks the code that would take its arguments, a road's being some two hundred, from Python's objects: for all
-    leaves, that is a third of the time that a run's kernels take to compile. When Python first calls it, it is
-    compiled once more, with that code.
+    It is compiled without the code that takes arguments from Python's objects (some two hundred numbers for a road),
+    on which a run would spend a third of the time to compile its kernels. The first call from Python compiles a second
+    kernel, which has this code.
     """
 
     def __call__(self, *arguments: Any) -> Any:
@@ -135,10 +135,10 @@ class Leaf(CPUDispatcher):
 
     @functools.cached_property
     def for_python(self) -> Callable[..., Any]:
-        """The kernel that Python can call."""
+        """The second kernel, which Python can call."""
         f = self.py_func
         copy = FunctionType(f.__code__, f.__globals__, argdefs=f.__defaults__, closure=f.__closure__)
-        copy.__qualname__ += " for Python"  # by which Numba names its files
+        copy.__qualname__ += " for Python"  # Numba names the files of its cache by this
         return njit(copy, fastmath=self.targetoptions["fastmath"])
 
 

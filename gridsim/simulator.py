@@ -274,7 +274,7 @@ def views(
     Returns: ranges (m) of the rays, float32 [n, rays], and observations with these features, float32 [n, values].
     """
     if len(cars) != len(worlds):
-        raise ValueError(f"there are {len(cars)} states of a car, and traffic of {len(worlds)}")
+        raise ValueError(f"each of {len(cars)} states needs its own traffic, not {len(worlds)} of them")
     simulation = simulations_on([scenario], config, features)[0]
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     observations = np.empty((len(cars), simulation.encoding.first[-1]), dtype=np.float32)

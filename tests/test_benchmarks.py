@@ -13,7 +13,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script (and its mode) and how it is run here; what `--json` must print.
 RUNS = {
     "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
-    # On two hosts where they can be had (below); otherwise on this one.
+    # Where a test can have two hosts, it adds --cluster.
     "faults.py": (
         ["--faults", "1", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
@@ -53,7 +53,7 @@ def test_script_runs(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPat
     arguments, figures = RUNS[name]
     script, *mode = name.split()
     if script == "faults.py" and not hosts.missing():
-        mode = ["--cluster"]
+        mode, figures = ["--cluster"], {*(figures or ()), "host_gone", "link_down"}
     if script == "roads.py":
         block = tmp_path_factory.mktemp("roads") / "block.osm"
         block.write_text(osm([street((0, 0), (200, 0), (200, 200), (0, 200), (0, 0))]))

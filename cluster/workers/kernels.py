@@ -108,7 +108,7 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
     cars = np.zeros((1, CAR_FIELDS), dtype=np.float32)
     views(road, cars, worlds, config, spec.features)
     clearances(road.road, freeze(cars[:, :2]))
-    # Last, as the other part has compiled most of it by now.
+    # This comes last, so that it finds in the cache what the process of the other part has compiled by then.
     trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
 
 

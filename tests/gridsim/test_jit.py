@@ -99,7 +99,7 @@ def _product_less(x, y, by=jit.ONE):
 
 
 @pytest.mark.parametrize("kind", [jit.leaf, jit.exact])
-def test_python_calls_what_kernels_inline_before_and_after_they_do(kind, tmp_path, monkeypatch):
+def test_python_gets_from_an_inlined_kernel_what_kernels_get(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
     x, y = np.random.default_rng(0).uniform(1.0, 2.0, (2, 1000)).astype(np.float32)
     for _ in range(2):  # compiled, and from the cache
@@ -110,11 +110,11 @@ def test_python_calls_what_kernels_inline_before_and_after_they_do(kind, tmp_pat
         def kernel(x, y, inlined=inlined):
             return inlined(x, y)
 
-        first = [called(*each) for each in zip(x, y, strict=True)]
+        by_python = [called(*each) for each in zip(x, y, strict=True)]
         in_kernel = [kernel(*each) for each in zip(x, y, strict=True)]
-        assert first == in_kernel == [inlined(*each) for each in zip(x, y, strict=True)]
-        # Contraction to one rounding is what `exact` forbids.
-        assert (first == [_product_less(*each) for each in zip(x, y, strict=True)]) == (kind is jit.exact)
+        assert by_python == in_kernel == [inlined(*each) for each in zip(x, y, strict=True)]
+        # A leaf may compute x * y - by with one rounding. `exact` rounds twice, as NumPy does.
+        assert (by_python == [_product_less(*each) for each in zip(x, y, strict=True)]) == (kind is jit.exact)
 
 
 # --- which folder
