@@ -1,4 +1,5 @@
-"""A campaign of faults: faults.py [--faults N] [--seed N] [--jobs N] [--workers N] [--cluster] [--json]
+"""A campaign of faults: faults.py [--faults N] [--generations N] [--seed N] [--jobs N] [--workers N]
+    [--cluster] [--json]
 
 A small evolution runs again and again, with two Ray workers or with --workers 0 in one process, several of them at
 once, beside an MLflow server of their own. At random moments one of FAULTS happens; a run that ended before its time is
@@ -44,8 +45,7 @@ from two_hosts import Cluster  # beside this file
 
 BIN = Path(sys.executable).parent
 SMALL = (  # but large enough to go on for some time after Ray is up
-    "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "30", "--until", "2",
-    "--seed", "5",
+    "--scenario", "curved", "--traffic", "2", "--population", "192", "--until", "2", "--seed", "5", "--generations",
 )  # fmt: skip
 PATIENCE_S = 10  # after which a silent worker is replaced
 WORKER = "ray::Actor"  # how the names of workers' processes begin
@@ -128,8 +128,8 @@ class Gate:
 class Campaign:
     """The runs, their server, and what happens to them. `folder` is a new one, of a short path."""
 
-    def __init__(self, folder: Path, seed: int, workers: int, clustered: bool):
-        self.workers = str(workers)
+    def __init__(self, folder: Path, seed: int, workers: int, generations: int, clustered: bool):
+        self.workers, self.small = str(workers), (*SMALL, str(generations))
         self.seed, self.counts, self.finished, self.champions = seed, Counter[str](), 0, set[str]()
         self.shared = threading.Lock()  # held while the server or the disk, which all runs share, is disturbed
         self._numbers, self._stopped = count(), False
@@ -186,9 +186,9 @@ class Campaign:
     # --------------------------------------------------------------------------------------------------------- runs
 
     def undisturbed(self) -> None:
-        """A run without faults, with which all others are compared."""
+        """A run without faults, in one process, with which all others are compared."""
         run = Run(self, "undisturbed")
-        if run.start("--workers", self.workers, "--name", run.name, "--tracking-uri", self.uri, *SMALL).wait(LONG_S):
+        if run.start("--workers", "0", "--name", run.name, "--tracking-uri", self.uri, *self.small).wait(LONG_S):
             raise Wrong(f"the undisturbed run fails: {run.last_words()}")
         self.check(run.name)
 
@@ -310,7 +310,7 @@ class Run:
     def drive(self, faults: int) -> None:
         """To its end, with faults until there were so many in all."""
         campaign = self.campaign
-        flags = ["--name", self.name, "--resume-if-exists", "--tracking-uri", campaign.uri, *SMALL]
+        flags = ["--name", self.name, "--resume-if-exists", "--tracking-uri", campaign.uri, *campaign.small]
         flags += ["--workers", campaign.workers, "--patience", str(PATIENCE_S)]
         if campaign.cluster:
             flags += ["--address", campaign.cluster.address]
@@ -430,6 +430,7 @@ def main() -> int:
     """Run it; 1 if a run did not survive."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=20, help="how many (20)")
+    parser.add_argument("--generations", type=int, default=30, help="of each run (30)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults and their moments (0)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once (1)")
     parser.add_argument("--workers", type=int, default=2, help="Ray workers of a run; 0: in one process (2)")
@@ -448,7 +449,7 @@ def main() -> int:
         subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
     folder = Path(tempfile.mkdtemp(prefix="gsf", dir="/tmp"))  # Ray's sockets need a short path
-    campaign, wrong = Campaign(folder, options.seed, options.workers, options.cluster), ""
+    campaign, wrong = Campaign(folder, options.seed, options.workers, options.generations, options.cluster), ""
     begun = time.monotonic()
     try:
         campaign.undisturbed()

@@ -59,9 +59,9 @@ def steps_per_s(cars: VecEnv, seconds: float) -> float:
     return steps / spent
 
 
-def vec_env_ratio(seconds: float) -> float:
+def vec_env_ratio(seconds: float, processes: int) -> float:
     """Ratio of their median rates, measured in turn."""
-    both: list[VecEnv] = [SB3VecEnv(ID, 1024), make_vec_env(ID, 8, vec_env_cls=SubprocVecEnv)]
+    both: list[VecEnv] = [SB3VecEnv(ID, 1024), make_vec_env(ID, processes, vec_env_cls=SubprocVecEnv)]
     for cars in both:
         cars.reset()
         steps_per_s(cars, seconds)  # builds maps
@@ -165,7 +165,7 @@ def main() -> None:
     learned = output(EXAMPLE, "--scenario", "curved", "--minutes", "0.05" if quick else "3")
     figures = {
         "import_gridsim_ms": 1e3 * statistics.median(float(output("-c", IMPORT)) for _ in range(7)),
-        "sb3_vec_env_ratio": vec_env_ratio(0.2 if quick else 2.0),
+        "sb3_vec_env_ratio": vec_env_ratio(*((0.2, 2) if quick else (2.0, 8))),
         "ppo_sb3_success": ppo_success(4096 if quick else 300_000, 4 if quick else 64),
         "ppo_example_success": float(re.findall(r"([\d.]+)%", learned)[-1]) / 100.0,
     }

@@ -32,6 +32,7 @@ nb_execution_mode = "force"
 nb_execution_in_temp = nb_execution_raise_on_error = True
 nb_execution_timeout = 400  # s
 nb_merge_streams = True
+nb_output_stderr = "warn"  # which fails the build
 
 # Docstrings put code between single backquotes, and flags in plain text.
 default_role, smartquotes = "code", False

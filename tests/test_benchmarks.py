@@ -15,7 +15,7 @@ RUNS = {
     "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
     # Where a test can have two hosts, it adds --cluster.
     "faults.py": (
-        ["--faults", "1", "--json"],
+        ["--faults", "1", "--generations", "10", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
     "learners.py": (

@@ -10,20 +10,15 @@ import pytest
 from commands import BIN, finish
 
 SMALL = "--scenario curved --traffic 0 --population 16 --car-steps 3000"
-COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --output"
+COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16"
 
 # What is run here, in this order, and what is added to make it small; the last of equal flags counts.
 HERE = {
     "make evolve": f"{SMALL} --name first",
     'make dqn ARGS="--seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --name other",
-    ".venv/bin/gridsim-evolve --resume runs/<name>": "",
     ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 6e7": "--car-steps 100000",
-    ".venv/bin/gridsim-evolve --name X --resume-if-exists": SMALL,
-    ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "--name again",
-    ".venv/bin/gridsim-evolve --init runs/<name>": f"{SMALL} --name next",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",
-    "make compare ARGS=--quick": f"{COMPARISON} quick",
-    "make compare": f"{COMPARISON} whole",
+    "make compare ARGS=--quick": COMPARISON,
     ".venv/bin/gridsim-compare runs/<name> runs/<other>": "",
     ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
     ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
@@ -45,7 +40,12 @@ TUTORIALS = {
 }
 ELSEWHERE = {
     "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
+    "make compare": "tests/cluster/test_compare.py::test_a_comparison_that_is_stopped",
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
+    ".venv/bin/gridsim-evolve --resume runs/<name>": "tests/cluster/test_cli.py::test_config_repeats_a_run",
+    ".venv/bin/gridsim-evolve --name X --resume-if-exists": "tests/cluster/test_cli.py::test_start_or_continue",
+    ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "tests/cluster/test_cli.py::test_config_repeats_a_run",
+    ".venv/bin/gridsim-evolve --init runs/<name>": "tests/cluster/test_cli.py::test_init_begins_with_a_champion",
     ".venv/bin/gridsim-watch runs/<name>": "tests/cluster/test_watch.py::test_window_is_shown_on_a_chosen_driver",
     ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_any_elite_is_watched",
     ".venv/bin/gridsim-drive --scenario city --record drive.csv": "tests/gridsim/test_drive.py::test_real_keys_drive",
