@@ -9,6 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import combinations_with_replacement, product
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -22,12 +23,11 @@ from gridsim.state import POSE
 _F = np.float32
 
 FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; see `SimConfig.file_speeds`
-# In units (`SimConfig.unit`), which are metres except for small cars.
-SUBSTEP = _F(1.0)  # most that a car moves between two collision checks
-REENTRY = _F(12.0)  # a car that returns to a cell within this distance driven is still on the same visit
+SUBSTEP = _F(1.0)  # units (`SimConfig.unit`) that a car moves between two collision checks, at most
+REENTRY = _F(12.0)  # units driven within which a car that returns to a visit cell is still on the same visit
 
 # Lanes. Own choices, unless a source is named.
-CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
+CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart or more
 
 # Traffic, besides `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight / (lower + upper end of the speed interval); 0.5 is the middle
@@ -35,7 +35,7 @@ SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed = lane's speed
 SPAWN_SPEED = _F(0.5)  # share of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = 1.0  # s between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
-# m per m2 of distance: the ego car's lane is judged along a straight line, with this tolerance for bends
+# m sideways per (m ahead)^2: tolerance for bends, as lanes are taken to be straight when the ego car's lane is judged
 NEIGHBOUR_WIDENING = _F(0.004)
 # A car looks ahead by the jam distance + LOOK_AHEAD m + its way in LOOK_AHEAD_TIME s + its braking distance.
 LOOK_AHEAD, LOOK_AHEAD_TIME = _F(8.0), _F(1.5)
@@ -43,33 +43,33 @@ CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 STOP_LINE_GAP = _F(0.25)  # m between a waiting car and the stop line; small, so that its rear clears a junction behind
 SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sideways, as in the curved road's bends
 STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
-LANE_CHANGE_ALONE = _F(20.0)  # m within which no car on a third lane may be changing lanes, perhaps to the same one
-KEEP_LANE = _F(30.0)  # m before a junction, or where lanes part, within which cars stay in their lane
+LANE_CHANGE_ALONE = _F(20.0)  # m; a car changes lanes only if no car on a third lane is changing lanes this near
+KEEP_LANE = _F(30.0)  # m before a junction, or a lane without a neighbour, within which cars stay in their lane
 SKEW = _F(0.05)  # m; neighbours' points with the same index count as side by side if neither is farther ahead than this
-WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
+WALKING_PACE = _F(2.0)  # m/s below which a car at a junction counts as standing, or as about to stop
 JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a crossing before the other lane is free
 
 # How traffic meets the ego car.
-MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
-SAME_WAY_COSINE = _F(0.3)  # of the angle between headings; above it, both cars go the same way or merge
+MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for an oncoming or crossing ego car
+SAME_WAY_COSINE = _F(0.3)  # cosine of the angle between two headings above which the cars go the same way or merge
 FORESIGHT = _F(3.0)  # s for which a car predicts the ego car's motion
 FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
-EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predicted collision
+EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car is taken to be able to stop before a predicted collision
 
 # Junctions.
 STANDING = _F(0.1)  # m/s below which a car stands
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
 PRIORITY_TIME = _F(4.0)  # s; a car gives way to cars with priority that would arrive less than this after its entry
-EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
+EGO_CLEARANCE = _F(7.0)  # m; no car enters a junction on a lane that comes this close to the ego car
 EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
-EGO_SECTOR_COSINE = _F(0.6)  # cosine of the angle to its heading within which the ego car may soon be
+EGO_SECTOR_COSINE = _F(0.6)  # cosine of the angle to the ego car's heading within which that car may soon be
 
 
 @dataclass(frozen=True)
 class _Vehicle:
-    """What all models of a vehicle may read."""
+    """The numbers of a vehicle that every vehicle model may read."""
 
     length: float = quantity(4.0, 0.2, 30.0, "m")
     width: float = quantity(2.0, 0.1, 5.0, "m")
@@ -81,10 +81,10 @@ class _Vehicle:
     reverse_limit: float = quantity(3.0, 0.0, 50.0, "m/s")  # backward
     acceleration: float = quantity(3.0, 0.1, 50.0, "m/s2")  # forward and in reverse
     braking: float = quantity(8.0, 0.1, 50.0, "m/s2")
-    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. Together with full braking, a
-    # car has 9.4: less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
+    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking, a car has
+    # 9.4 m/s2 in all: less than g, and than the 11.5 m/s2 of CommonRoad's friction circle (Althoff et al. 2017).
     lateral_grip: float = quantity(4.9, 0.1, math.inf, "m/s2")
-    model: str = "kinematic"  # of `car.models.MODELS`
+    model: str = "kinematic"  # a key of `car.models.MODELS`
     latency: float = quantity(0.0, 0.0, 2.0, "s")  # by which commands are late
 
 
@@ -101,7 +101,7 @@ class SensorConfig:
     field_of_view: float = quantity(120.0, 1.0, 240.0, "degrees")  # centred on the heading
     range: float = quantity(50.0, 1.0, 63.0, "m")  # readings are ranges / range, in [0, 1]
     noise: float = quantity(0.0, 0.0, 10.0, "m")  # standard deviation of a reading
-    noise_share: float = quantity(0.0, 0.0, 1.0)  # the same, as a share of the range
+    noise_share: float = quantity(0.0, 0.0, 1.0)  # added to `noise`, as a share of the measured distance
     dropout: float = quantity(0.0, 0.0, 1.0)  # share of readings that are the full range, whatever is there
     latency: float = quantity(0.0, 0.0, 2.0, "s")  # by which readings are late
 
@@ -138,7 +138,7 @@ class TrafficConfig:
     safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # most that a lane change may make the car behind brake
     lane_change_speed: float = quantity(1.25, 0.1, 10.0, "m/s")  # sideways, at most
     verge: float = quantity(0.3, 0.0, 10.0, "m")  # from the road's edge to a car that has moved to the right, at least
-    give_way: float = quantity(0.9, 0.0, 10.0, "m")  # to the right for oncoming cars, at most
+    give_way: float = quantity(0.9, 0.0, 10.0, "m")  # that a car moves to the right for the ego car, at most
     taper: float = quantity(0.1, 0.001, 1.0)  # m to the right per m driven while giving way
     beside: float = quantity(0.35, 0.0, 10.0, "m")  # between the sides of cars on crossing lanes, at least
     spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars at the start of an episode, at least
@@ -149,8 +149,8 @@ class TrafficConfig:
 
 
 MOST_STEPS = 65_535  # control steps of an episode, at most
-LENGTH = 4.0  # m, of a car whose unit is 1 m
-LEAST_UNIT = 1 / 16  # m
+LENGTH = 4.0  # m, length of the car for which roads are sized: its unit (`SimConfig.unit`) is 1 m
+LEAST_UNIT = 1 / 16  # m, the smallest `SimConfig.unit`
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class SimConfig:
     randomise: tuple[tuple[str, float, float], ...] = ()
 
     def drawn(self, start: np.ndarray) -> SimConfig:
-        """The configuration with the vehicle of one episode, drawn from its start float32 [5 or more]."""
+        """The configuration with one episode's vehicle, drawn with the episode's start float32 [5 or more] as seed."""
         if not self.randomise:
             return self
         rng = np.random.default_rng(
@@ -176,10 +176,10 @@ class SimConfig:
 
     @classmethod
     def load(cls, source: SimConfig | str | os.PathLike[str]) -> SimConfig:
-        """A preset by its name, or a YAML file with any of vehicle, sensors, episode and traffic; see docs/own.md.
+        """The configuration of a preset, by its name, or of a YAML file, by its path; see docs/own.md.
 
-        What a file does not give is as in the preset that it names as its `base`, or else the default. A SimConfig is
-        returned as it is. Raises: GridSimError.
+        Values that a file lacks are those of the preset that it names as its `base`, or else the defaults. A SimConfig
+        is returned as it is. Raises: GridSimError.
         """
         if isinstance(source, SimConfig):
             return source
@@ -246,9 +246,13 @@ class SimConfig:
             least, most = (number(end, f"randomise.{name}", *LIMITS["vehicle"][name]) for end in ends)
             if least > most:
                 raise GridSimError(f"randomise.{name} must be least and most, not {least:g} and {most:g}")
-            for end in ends:
-                changed: dict[str, Any] = {name: end}
-                replace(self, vehicle=replace(self.vehicle, **changed), randomise=()).check()
+        for (one, *ends), (other, *others) in combinations_with_replacement(self.randomise, 2):
+            for end, other_end in product(ends, others):  # two numbers may contradict each other
+                changed: dict[str, Any] = {one: end, other: other_end}
+                drawn = replace(self, vehicle=replace(self.vehicle, **changed), randomise=())
+                drawn.check()
+                if drawn.unit != self.unit:
+                    raise GridSimError(f"randomise.{one}: a car of {end:g} m is for roads of another scale")
         vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
         if vehicle.model not in MODELS:
             raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {shown(vehicle.model)}")
@@ -258,7 +262,7 @@ class SimConfig:
         if not vehicle.rear_axle < vehicle.wheelbase:
             text = f"below vehicle.wheelbase, {vehicle.wheelbase:g} m: the centre of mass lies between the axles"
             raise GridSimError(f"vehicle.rear_axle must be {text}, not {vehicle.rear_axle:g}")
-        reach = LIMITS["sensors"]["range"][1] * self.unit  # half the shortest side of a generated map
+        reach = LIMITS["sensors"]["range"][1] * self.unit  # below half the shortest side of generated maps
         if self.sensors.range > reach:
             text = f"at most {reach:g} m for a car of {vehicle.length:g} m"
             raise GridSimError(f"sensors.range must be {text}, not {self.sensors.range:g}")
@@ -291,7 +295,7 @@ def names_file(name: str) -> bool:
 
 
 def _check_names(where: str, given: Mapping[Any, Any], known: list[str]) -> None:
-    """Raises: GridSimError for a name that is not known, with the nearest one that is."""
+    """Raises: GridSimError for a name that is not known; the message names the most similar known name, or all."""
     for name in given:
         if name not in known:
             like = difflib.get_close_matches(str(name), known, 1)
@@ -314,13 +318,13 @@ def _preset(name: str) -> SimConfig:
 class Constants(NamedTuple):
     """`SimConfig` as the kernels read it: SI units and radians.
 
-    This is no NumPy record, because kernels that read one drive 2 to 4 % slower, though they compile a fifth faster.
+    It is not a NumPy record, because kernels that read one run 2 to 4 % slower, though they compile a fifth faster.
     """
 
     half_length: np.float32  # m
     half_width: np.float32  # m
     front_axle: np.float32  # m ahead of the centre of mass
-    rear_axle: np.float32  # m
+    rear_axle: np.float32  # m behind the centre of mass
     rear_share: np.float32  # l_r / (l_f + l_r)
     steering_limit: np.float32  # rad
     steering_step: np.float32  # rad per control period
@@ -334,7 +338,7 @@ class Constants(NamedTuple):
     ray_range: np.float32  # m
     ray_first: np.float32  # rad, of the rightmost ray from the heading
     ray_step: np.float32  # rad
-    progress: np.float32  # m in a control step
+    progress: np.float32  # m of new ground in a control step, below which a car idles
     revisit: np.float32  # m
     patience: np.int32  # steps
     courtesy: np.float32  # m
@@ -349,7 +353,8 @@ def constants(config: SimConfig) -> Constants:
     config.check()
     vehicle, sensors, episode = config.vehicle, config.sensors, config.episode
     view = math.radians(sensors.field_of_view)
-    # Two cars approach each other by at most `approach` in a control step; within courtesy, waiting is not idleness.
+    # `near` reaches all cars that a car can touch in a control step, in which two cars approach each other by at most
+    # `approach` m, and all those behind which it may wait (`courtesy`).
     approach = 2.0 * vehicle.speed_limit * episode.control_period
     near = math.hypot(vehicle.length + config.traffic.courtesy, vehicle.width) + approach
     f = np.float32

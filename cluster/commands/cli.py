@@ -1,4 +1,7 @@
-"""The commands: parse, build, run. Wrong use exits with one clear line and 2, Ctrl-C saves and exits with 130."""
+"""gridsim-evolve, gridsim-dqn and gridsim-evaluate.
+
+Wrong use exits with one clear line and code 2. Ctrl-C saves what a run has learned, and exits with code 130.
+"""
 
 from __future__ import annotations
 
@@ -81,8 +84,9 @@ class RunFlags:
 class EvolveFlags:
     """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
 
-    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
-    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    The run's folder holds the champion, history, pictures and a checkpoint, which is renewed every second, or after a
+    generation that takes longer; MLflow holds its curves. The champion depends on the scenario, the seed and the
+    algorithm's parameters alone, never on the workers.
     """
 
     example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1"
@@ -108,7 +112,7 @@ class DqnFlags:
 
 Flags = EvolveFlags | DqnFlags
 FLAGS: dict[str, Any] = {EvolveSettings.command: EvolveFlags, DqnSettings.command: DqnFlags}
-# Flags that may differ when a run is resumed: where it is computed and logged, and how it is found.
+# Flags that may differ when a run is resumed: where it is computed and logged, how it is found, and its time limit.
 MAY_DIFFER = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
 MAY_DIFFER |= {"resume", "resume_if_exists", "config", "wall_time"}
 
@@ -191,7 +195,7 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
 
 
 def _fitness(settings: RunSettings) -> str:
-    """The fitness of one's own that settings name, or ""."""
+    """The name of the user's own fitness function (--fitness) in these settings, or ""."""
     return settings.fitness if isinstance(settings, EvolveSettings) else ""
 
 
@@ -239,7 +243,7 @@ def _learn(prog: str) -> int:
         initial = load_champion(run.init).genome if run.init and run.saved is None else None
         with RunDisplay(console, settings) as shown:
             session = train(run, place, shown.event, shown.row, initial=initial, started=STARTED)
-    except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
+    except (KeyboardInterrupt, SystemExit):  # SystemExit is rich's, if the output's reader has ended
         problem = ""
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         problem = str(error) or type(error).__name__
@@ -264,7 +268,7 @@ def _send_missing(console: Console, run: RunFolder, meta: Mapping[str, Any], wor
     """Send to MLflow what it lacks of a finished run, and say how to go on."""
     settings = run.settings
     sent, unsent = sync(run.path, work.tracking_uri, work.experiment, read_run)
-    if sent:  # perhaps MLflow was away as the run ended
+    if sent:  # if MLflow was away as the run ended, the summary lacks the id
         summary = json.loads((run.path / SUMMARY).read_bytes())
         write_json(run.path / SUMMARY, summary | {"mlflow_run_id": saved_run_id(run.path)})
     done = f"sent to MLflow: {sent}" if sent else "nothing to do"
@@ -361,14 +365,14 @@ def _evaluate_suite(flags: EvaluateFlags) -> int:
         line = f"digest {found['digest'][:16]}, champion {champion.sha256[:16]}: {short_path(path)}"
         lines = [line, *filter(None, [suite.compared(before, found)])]
         new_console().print(*lines, sep="\n", soft_wrap=True)
-    write_json(path, found)  # last: what was measured is shown, also where it cannot be kept
+    write_json(path, found)  # last, so that figures are shown even if this fails
     return 0
 
 
 def _stress(
     champion: Champion, chosen: tuple[str, int, int, Traffic | None], picture: Path, flags: EvaluateFlags
 ) -> list[Any]:
-    """Drive a champion under each stress, and draw it."""
+    """Drive a champion at each level of each stress, draw its success to `picture`, and return what was measured."""
     asked = stress.stresses(champion)
     drives = stress.drive(champion, asked, *chosen)
     total = sum(len(each.levels) for each in asked)

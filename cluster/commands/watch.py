@@ -161,7 +161,10 @@ def _watch() -> int:
 
 
 def _elite(run: Path, generation: int | None) -> tuple[Champion, str]:
-    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and its name."""
+    """The elite of a run's generation (of a DQN: the network of an evaluation), and its name.
+
+    If `generation` is None, it is the newest one; before the first, this waits. Raises GridSimError, Stopped.
+    """
     settings, _ = read_config(run / CONFIG)
     step = settings.step_name
     if generation is None and not (run / CHECKPOINT).exists():
@@ -182,9 +185,10 @@ def _is_recording(source: str) -> bool:
 
 
 def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
-    """Yield drives and who drives: a recording's episodes, else drives of a champion or elite, in a window without end.
+    """Yield drives, each with its driver's name. Raises GridSimError.
 
-    Raises: GridSimError.
+    Of a recording these are its episodes. A champion or elite drives once for a film or a page; for a window it drives
+    map after map, without end.
     """
     if _is_recording(flags.source):
         yield from _recorded(flags)
@@ -194,14 +198,19 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
         champion, name = _driver(source, flags)
         road = full_name(flags.scenario or champion.scenario)
         scenario, start = _map(road, seed, champion.sim)
-        crowds = champion.crowds_on(road, flags.asked)
-        cars = crowds[road_number(seed, len(crowds))]
+        cars = _cars(champion, road, seed, flags)
         world = spawn(scenario.network, start[None], cars, np.array([scenario.seed]), champion.sim)[0]
         yield record(champion, scenario, start, seconds, world), name
 
 
+def _cars(champion: Champion, road: str, seed: int, flags: WatchFlags) -> int:
+    """The number of other cars on the map of a seed, absent ones included."""
+    crowds = champion.crowds_on(road, flags.asked)
+    return crowds[road_number(seed, len(crowds))]
+
+
 def _driver(source: Path, flags: WatchFlags) -> tuple[Champion, str]:
-    """Who drives, and its name."""
+    """The champion or elite that drives, in the car of --sim, and its name."""
     elite = flags.follow or flags.generation is not None
     champion, name = _elite(source, flags.generation) if elite else (load_champion(source), "champion")
     return champion.in_sim(flags.sim), name
@@ -223,7 +232,7 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
 
 
 def _title(drive: Recording, name: str) -> str:
-    """Who drives where; a map file has only one map."""
+    """Who drives where: the driver, the road, and the map's seed, except that a map file has only one map."""
     road = drive.scenario
     return f"{name}    {label(road.name)}" + ("" if is_map_file(road.name) else f", map {road.seed:,}")
 
@@ -239,8 +248,9 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
             mark = str(k) if not flags.beside else of if k == 1 else f"{of} {k}"
             shown.append(Shown(f"{name} of {source}", mark, found))
             if not _is_recording(source):  # the others drive on the same road, among as many cars
-                road = flags.scenario or _driver(Path(source), flags)[0].scenario
-                flags = dataclasses.replace(flags, scenario=road, traffic=found.boxes.shape[1])
+                champion, _ = _driver(Path(source), flags)
+                road = full_name(flags.scenario or champion.scenario)
+                flags = dataclasses.replace(flags, scenario=road, traffic=_cars(champion, road, flags.seed, flags))
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     sims = [each.drive.sim for each in shown]

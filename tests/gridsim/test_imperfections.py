@@ -120,6 +120,8 @@ def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> Non
         ((("model", 1.0, 2.0),), "unknown key randomise.'model'"),
         ((("width", 2.0, 1.0),), "randomise.width must be least and most, not 2 and 1"),
         ((("width", 0.0, 1.0),), "randomise.width must be "),
+        ((("rear_axle", 1.2, 2.0), ("wheelbase", 1.8, 3.0)), "rear_axle must be below vehicle.wheelbase, 1.8 m"),
+        ((("length", 1.0, 4.0),), "randomise.length: a car of 1 m is for roads of another scale"),
     ],
 )
 def test_wrong_ranges_are_refused(randomise: tuple, said: str) -> None:

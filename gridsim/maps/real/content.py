@@ -1,4 +1,4 @@
-"""A file's bytes and its format, told by its content. XML with entities is refused, and so is what is too large."""
+"""A file's bytes and its format, told by its content. XML with entities is refused, and so are files too large."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORMATS = "OpenStreetMap, OpenDRIVE, SUMO (.net.xml), CommonRoad and Lanelet2"
 
 
 def read_content(path: Path) -> bytes:
-    """A file's bytes, unpacked if they are a .gz."""
+    """A file's bytes: gzip is unpacked, a .pbf converted to XML. Its content, not its name, tells what it is."""
     data = read_bytes(path)
     if data[:2] == b"\x1f\x8b":
         try:
@@ -32,12 +32,12 @@ def read_content(path: Path) -> bytes:
     if not data.strip():
         raise GridSimError(f"{path}: the file is empty")
     if b"OSMHeader" in data[:64]:
-        return _from_pbf(path)
+        return _from_pbf(path, data)
     return data
 
 
-def _from_pbf(path: Path) -> bytes:
-    """OpenStreetMap's packed form as XML."""
+def _from_pbf(path: Path, data: bytes) -> bytes:
+    """The content of a .pbf, OpenStreetMap's binary format, as XML."""
     try:
         import osmium
     except ImportError:
@@ -46,7 +46,7 @@ def _from_pbf(path: Path) -> bytes:
         unpacked = Path(folder) / "all.osm"
         try:
             with osmium.SimpleWriter(str(unpacked)) as writer:
-                for k, thing in enumerate(osmium.FileProcessor(str(path))):
+                for k, thing in enumerate(osmium.FileProcessor(osmium.io.FileBuffer(data, "pbf"))):
                     writer.add(thing)
                     if k % 100_000 == 0 and unpacked.stat().st_size > MAX_BYTES:
                         break

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-# m, the longest way back that is removed where lanes are joined; it arises if nodes are closer than junctions are wide
+# m; where lanes are joined, the line may run backwards, if a file's nodes are closer together than junctions are wide.
+# A stretch backwards is removed if it is at most this long.
 RETURN = 4.0
-RETURN_COSINE = -0.2  # of the angle by which the line turns at such a point, at most
+RETURN_COSINE = -0.2  # a line runs backwards where the cosine of its turn at a point is at most this
 
 
 @dataclass
@@ -23,10 +24,10 @@ class Lane:
     successors: list[str] = field(default_factory=list)
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
-    junction: str | None = None  # the junction of the file that it is in; "": none; None: the format does not tell
-    links: frozenset[str] = frozenset()  # names of the file's ways through junctions that are part of it
-    yields: frozenset[str] = frozenset()  # those to which it gives way, as the file says
-    light: str = ""  # the program by which cars enter it: g, y or r for each second, repeated; "": no light
+    junction: str | None = None  # the file's junction that the lane is in; "": none; None: the format does not tell
+    links: frozenset[str] = frozenset()  # names of the file's connections through junctions that are part of this lane
+    yields: frozenset[str] = frozenset()  # names of connections to which cars on this lane give way, as the file says
+    light: str = ""  # cycle of the traffic light at its beginning: g, y or r for each second; "": no light
 
     @property
     def centre(self) -> np.ndarray:
@@ -43,13 +44,13 @@ class Lane:
 class RealRoad:
     """The roads of a file, in its own coordinates (m)."""
 
-    format: str  # its name in words
+    format: str  # the format's name for users, such as OpenStreetMap
     lanes: dict[str, Lane]
     junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
     degrees: tuple[
         float, ...
     ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
-    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0: found from the lanes
+    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0: unknown (`load.hand_of`)
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property
@@ -59,7 +60,10 @@ class RealRoad:
 
 
 def paired(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two bounds, resampled: both get a point at each share of their lengths at which either has one."""
+    """Two bounds resampled to equally many points, so that point i of one is beside point i of the other.
+
+    Both get a point at each relative arc length (0 to 1) at which one of them has a point.
+    """
     shares = [_shares(bound) for bound in (left, right)]
     both = np.unique(np.round(np.concatenate(shares), 9))
     return tuple(
@@ -91,14 +95,17 @@ def bounds_of(centre: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]
     step /= np.maximum(np.hypot(*step.T), 1e-9)[:, None]
     before, after = np.vstack([step[:1], step]), np.vstack([step, step[-1:]])
     along = before + after
-    # At a bend, the bound lies farther out by 1 / cos(half the bend), here at most by half.
+    # At a bend, a bound is farther from the middle line by a factor of 1 / cos(half the turn), here 3**0.5 at most.
     along /= np.maximum((along * before).sum(axis=1), 2.0 / 1.5 * 0.5)[:, None]
     aside = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))]) * (width / 2)
     return centre + aside, centre - aside
 
 
 def part_of(lane: Lane, first: float, last: float) -> Lane:
-    """The part of a lane between two arc lengths (m) along its middle line; without successors."""
+    """The part of a lane between two arc lengths (m) along its middle line, without successors.
+
+    The part has the lane's light only if it begins where the lane begins.
+    """
     shares, length = _shares(lane.centre), lane.length
     a, b = max(first / length, 0.0), min(last / length, 1.0)
     at = np.concatenate([[a], shares[(shares > a + 1e-6) & (shares < b - 1e-6)], [b]])
@@ -109,12 +116,12 @@ def part_of(lane: Lane, first: float, last: float) -> Lane:
 
 
 def joined(one: Lane, other: Lane) -> Lane:
-    """Two lanes, of which one follows the other, as one; with the successors of the second."""
+    """One lane made of `one` and of `other`, which follows it; with the successors of `other`."""
     left, right = (np.concatenate([a, b[1:]]) for a, b in ((one.left, other.left), (one.right, other.right)))
     kept = _without_returns((left + right)[:, :2] / 2)
-    speeds = [lane.speed for lane in (one, other) if not math.isnan(lane.speed)]
+    limited = [lane for lane in (other, one) if not math.isnan(lane.speed)]
     junction = one.junction if one.length > other.length else other.junction
-    speed = (one if one.length > other.length else other).speed if speeds else math.nan
+    speed = max(limited, key=lambda lane: lane.length).speed if limited else math.nan
     successors = list(other.successors)
     return replace(
         one,
@@ -130,7 +137,7 @@ def joined(one: Lane, other: Lane) -> Lane:
 
 
 def _without_returns(line: np.ndarray) -> list[int]:
-    """Which points of a polyline [n, 2] to keep, so that it does not go back a little and then forth again."""
+    """Indices of the points of a polyline [n, 2] to keep, so that it does not run backwards (see RETURN)."""
     kept: list[int] = []
     for k in range(len(line)):
         kept.append(k)
@@ -144,7 +151,7 @@ def _without_returns(line: np.ndarray) -> list[int]:
 
 
 def groups_of(lanes: dict[str, Lane]) -> list[list[str]]:
-    """Lanes side by side, from left to right; each lane is in one group."""
+    """Groups of lanes side by side, each from left to right; a lane without neighbours is a group of its own."""
     found, done = [], set()
     for key in lanes:
         first = key

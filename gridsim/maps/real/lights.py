@@ -22,7 +22,10 @@ APART = 1.6  # m from a stop line's end to the middle of another lane that leads
 
 
 def program(phases: Sequence[tuple[str, float]], offset: float = 0.0) -> str:
-    """`Lane.light` of phases: colours and durations (s); the first begins at `offset` (s). "": it never changes."""
+    """`Lane.light` of phases, each a colour and a duration (s); the first begins at `offset` (s).
+
+    "": the light never changes, is never green, or has a cycle under 1 s or over LONGEST_CYCLE.
+    """
     times = [USUAL_PHASE if time > LONGEST_PHASE else max(time, 0.0) for _, time in phases]
     if not 1.0 <= sum(times) <= LONGEST_CYCLE or len({colour for colour, _ in phases}) < 2:
         return ""
@@ -51,6 +54,8 @@ def with_lights(network: Network, lanes: dict[str, Lane], road: Road) -> Network
         if "r" in text and line not in lines:  # lanes that end at one place have one line
             programs.append(text)
             lines.append(line)
+    if not lines:  # the remaining lights would stop nobody
+        return network
     own = sorted(set(light) - {""})
     programs += own
     signals = [own.index(text) + len(lines) if text else -1 for text in light]
@@ -59,14 +64,14 @@ def with_lights(network: Network, lanes: dict[str, Lane], road: Road) -> Network
 
 
 def _together(lights: list[str]) -> str:
-    """The program of a line before several lanes: it is open while the light of any of them is green."""
+    """The program of a stop line before several lanes: at each time, it shows the most permissive of their lights."""
     cycle = math.lcm(*map(len, lights))
     cycle = cycle if cycle <= LONGEST_CYCLE else max(map(len, lights))
     return "".join(min((light[k % len(light)] for light in lights), key=SHOWS.__getitem__) for k in range(cycle))
 
 
 class _Ways:
-    """Where lanes lead, to find how far a stop line may reach."""
+    """Points and directions of all lanes, to find how far a stop line may reach."""
 
     def __init__(self, network: Network, road: Road):
         self.network, self.road, self.size = network, road, np.array([network.width, network.height], dtype=float)
@@ -78,9 +83,10 @@ class _Ways:
         self.tree = cKDTree(np.mod(np.mod(points, self.size), self.size), boxsize=self.size)
 
     def stop_line(self, before: int, after: list[int]) -> list[float]:
-        """A row of `Network.lines` at the end of a lane: to the edge of the road, or to lanes that go the same way.
+        """A row of `Network.lines`: the stop line at the end of lane `before`, which leads to the lanes `after`.
 
-        The line also crosses lanes that come the other way, so that a car that overtakes on these must stop, too.
+        It reaches to the edge of the road, or to lanes that go the same way. It also crosses lanes that come the other
+        way, so that a car that overtakes on these must stop, too.
         """
         end = self.network.offsets[before + 1] - 1
         place, along = self.network.points[end].astype(float), self.heading[end]
