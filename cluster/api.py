@@ -1,4 +1,4 @@
-"""GridSim's Python API: train, also with your own fitness or search, load, drive, evaluate.
+"""GridSim's Python API: train drivers, also with your own fitness or search; load, drive and evaluate them.
 
 `import gridsim` offers all of it: `gridsim.evolve(scenario="city", workers=2)`.
 """
@@ -67,18 +67,20 @@ def evolve(
     Args:
         settings: what the command's flags set; alternatively give these by name, such as scenario="city".
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
-            with fields distance (m), paced (m at a speed within the interval), steps, end (`gridsim.state.End`) and
-            figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
-            `evolution.episodes.fitness.scalar`. A name, as of --fitness, is found as the command finds it.
-        workers: Ray workers on this machine; 0 evaluates in this process, on all its cores.
+            with fields distance (m), paced (m at a speed within the road's interval), steps, end (`gridsim.state.End`),
+            and figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
+            `evolution.episodes.fitness.scalar`. A string is a name as for --fitness.
+        workers: number of Ray workers; 0 without `address`: this process evaluates, on all its cores.
         on_generation: called with the number of generations done and the latest one's figures.
         folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
         resume: go on with the run in `folder` if there is one.
-        address: a Ray cluster, host:port or "auto", to run the workers on; 0 workers are then one for each free CPU.
+        address: a Ray cluster, host:port or "auto", to run the workers on instead of this machine; with it, 0 workers
+            mean one for each free CPU.
         tracking_uri: MLflow's address, to which a run with a folder is sent; None sends nothing.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
-    `.../mean` is over all members on training episodes, `.../best` of the best genome so far on its own episodes.
+    `.../mean` is over all members on training episodes, `.../best` of the leader (the best genome known before the
+    generation) on longer episodes of its own.
     Raises: GridSimError; the message is one line.
     """
     settings = settings or EvolveSettings(**flags)
@@ -98,17 +100,19 @@ def train_dqn(
     tracking_uri: str | None = None,
     **flags: Any,
 ) -> Trained:
-    """Train a driver by deep Q-learning, like `evolve`; the history has a row for each evaluation.
+    """Train a driver by deep Q-learning.
 
     >>> import gridsim
     >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
+
+    Arguments and result are as for `evolve`, with an evaluation in place of a generation.
     """
     settings = settings or DqnSettings(**flags)
     return _train(settings, workers, on_evaluation, folder, resume, address, tracking_uri)
 
 
 def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Compare finished runs, as `gridsim-compare RUNS` does: each one's figures, and errors against the reference.
+    """Compare finished runs, as `gridsim-compare RUNS` does: their figures, and errors against a reference driver.
 
     Args:
         runs: their folders; a comparison's folder stands for all of its finished runs.
@@ -162,7 +166,7 @@ def _train(
 def _train_in(
     folder: Path, settings: RunSettings, place: Place, on_row: OnStep, resume: bool, tracking_uri: str | None
 ) -> Trained:
-    """Train a run in a folder, or go on with it; a finished one is read."""
+    """Train a new run in a folder, or resume the run in it. If that is finished already, it is only read."""
     if resume and (folder / CHECKPOINT).is_file():
         run = open_run(folder)
         settings = settings.extending(run.settings)

@@ -34,7 +34,7 @@ class Evaluator:
     ...     evaluator.fitness(np.zeros((2, evaluator.genes), dtype=np.float32)).shape
     (2,)
 
-    Attributes: `genes`, the size of a genome; `spec`, its network.
+    Attributes: `genes`, the number of genes of a genome; `spec`, the network, as a `PolicySpec`.
     """
 
     def __init__(
@@ -53,10 +53,11 @@ class Evaluator:
         Args:
             scenario: a road's name, or a map file.
             policy: the network, as for --policy of gridsim-evolve, with the same default.
-            traffic: other cars, usual, heavy or a number; -1 is as many as the road has by default.
-            sim: vehicle, sensors, episodes and traffic, or the name of a preset or a file with these, by default as
-                for gridsim-evolve. A lower target and time limit make an evaluation shorter.
-            workers, address: Ray workers, and a cluster's address; by default this process's threads.
+            traffic: number of other cars, or "usual" or "heavy"; -1 is as many as the road has by default.
+            sim: the simulator's configuration (vehicle, sensors, episodes, traffic), or the name of a preset or of a
+                YAML file; "" is as by default in gridsim-evolve. A lower target and time limit make an evaluation
+                shorter.
+            workers, address: number of Ray workers, and a Ray cluster's address; by default threads of this process.
             episodes: how many each genome drives.
             actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
 
@@ -103,17 +104,20 @@ class Evaluator:
         return self._drive(genomes, self._draw(seed), comfort=True)
 
     def fitness(self, genomes: np.ndarray, seed: int = 0) -> np.ndarray:
-        """The scores float64 [n] of gridsim-evolve, in [0, 1], higher is better; otherwise as `evaluate`."""
+        """Drive as `evaluate`. Returns: gridsim-evolve's default fitness, float64 [n] in [0, 1], higher is better."""
         episodes = self._draw(seed)
         return fitness.scalar(self._drive(genomes, episodes), episodes.rows["target"].astype(np.float64))
 
     def champion(self, genome: np.ndarray, sim: SimConfig | None = None) -> Champion:
-        """A genome [genes] as a champion, to save, watch or evaluate on held-out roads; `sim` is by default ours."""
+        """A genome [genes] as a champion, to save, watch or evaluate on held-out roads.
+
+        Args: `sim`, the configuration that it drives with; by default the evaluator's.
+        """
         s, genome = self._settings, self._checked(np.asarray(genome)[None])[0]
         return Champion(genome, str(self.spec), s.scenario, sim or self._sim, s.traffic)
 
     def _draw(self, seed: int) -> Episodes:
-        """New starts on training maps."""
+        """Episodes with new starts on training maps, drawn at random from the seed."""
         if seed < 0:
             raise GridSimError(f"a seed must be 0 or more, not {seed}")
         rng = np.random.default_rng(np.random.SeedSequence([seed, 21]))

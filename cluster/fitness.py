@@ -1,7 +1,8 @@
 """Fitness functions of the user's own: found by name, called, and their faults said in one line.
 
-A function is named `MODULE:FUNCTION` or `FILE.py:FUNCTION`, or is given in Python. Its code runs in the run's own
-process, never in Ray's workers, and only if the user names it in the command: that config.json names it is not enough.
+A function is named `MODULE:FUNCTION` or `FILE.py:FUNCTION`, or is passed to the Python API as an object. Its code runs
+in the run's own process, never in Ray's workers, and only if the user names or passes it: when a run is resumed or
+repeated, it is not enough that its config.json names the function.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _given: dict[str, Fitness] = {}  # functions that were given as objects, by thei
 
 
 def give(function: Fitness) -> str:
-    """Keep a function that is given in Python. Returns: the name by which `load` finds it in this process."""
+    """Keep a function that is passed as an object. Returns: the name by which `load` finds it in this process."""
     name = f"{getattr(function, '__module__', '?')}:{getattr(function, '__qualname__', type(function).__name__)}"
     forget()
     _given[name] = function
@@ -45,7 +46,10 @@ def forget() -> None:
 
 @cache
 def load(name: str) -> Fitness:
-    """The function of a name; if its own code fails or its scores do not fit, it raises GridSimError, as this does."""
+    """The fitness function of a name. Raises: GridSimError if it cannot be found or imported.
+
+    The function that is returned checks itself: it raises GridSimError if its code fails or its scores do not fit.
+    """
     function = _given.get(name) or _find(name)
 
     def score(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
@@ -81,7 +85,7 @@ def _file(name: str) -> Path:
         return Path(source)
     first, *others = source.split(".")
     with _working_folder():
-        found = importlib.util.find_spec(first)  # of `a.b` only `a`: to find all of it, Python would run `a`
+        found = importlib.util.find_spec(first)  # only `a` of a name `a.b`: to find `a.b`, Python would run `a`
     if not found or not found.origin:
         raise ValueError
     path = Path(found.origin).parent.joinpath(*others) if others else Path(found.origin)
@@ -89,7 +93,7 @@ def _file(name: str) -> Path:
 
 
 def absolute(name: str) -> str:
-    """A name that means the same in every folder."""
+    """A function's name in which a file's path, if there is one, is absolute: it means the same in every folder."""
     file, mark, function = name.rpartition(":")
     return f"{os.path.abspath(file)}{mark}{function}" if file.endswith(".py") else name
 
@@ -141,7 +145,7 @@ def _place(function: Any) -> str:
 
 
 def _fault(error: Exception) -> str:
-    """File and line of an error, and its last line."""
+    """An error in one line: file and line of the user's code that raised it, its type and message."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{Path(error.filename).name}:{error.lineno}: SyntaxError: {error.msg}"
     others = (__file__, importlib.__file__)

@@ -16,7 +16,7 @@ _SECRET = "pass|pw|token|secret|key|cred|sig|auth|odbc_connect"  # parts of the 
 
 
 def redacted(uri: str) -> str:
-    """An address without user and password, without a fragment, and with harmless query parameters alone.
+    """An address without user and password, with only `_HARMLESS` query parameters; of http also without a fragment.
 
     A password may hold an @ or a slash, so everything up to the last @ is left out. An @ behind a question mark may
     belong to a password or to a parameter: then the address is shown as its scheme and `UNCLEAR`.
@@ -35,7 +35,7 @@ def redacted(uri: str) -> str:
 
 
 def one_line(error: BaseException, uri: str = "") -> str:
-    """An error in one line, without secrets; for errors of the system only the reason.
+    """An error in one line, without secrets; of an operating system's error (`[Errno ...]`) only the reason.
 
     Args: `uri` is the address that was used: the error's text may hold it, with its password.
     """
@@ -48,7 +48,7 @@ def one_line(error: BaseException, uri: str = "") -> str:
         return reasons[-1].strip()
     if "timed out" in text.lower():
         return "no answer in time"
-    # Up to the last @ of the line, as a password may hold a space.
+    # Remove user and password: all from // to the last @ of the line, since a password may hold spaces.
     line = re.sub(r"([\w.+-]*:?//)[^@]*:.*@", r"\1", text.splitlines()[0])
     line = re.sub(r"[\w.+-]*:?//\S+|\S*:\S*@\S*", lambda address: redacted(address[0]), line)
     return re.sub(rf"([\w.%-]*(?:{_SECRET})[\w.%-]*['\"]?)(\s*[=:]\s*)\S+", r"\1\2...", line, flags=re.IGNORECASE)[:200]

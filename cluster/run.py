@@ -1,9 +1,9 @@
 """A training run, new or resumed, from its start to its end.
 
-A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: first
-their records (`store/steps.py`), then the checkpoint that counts them, then history.csv, from which MLflow gets its
-rows. Whatever kills the process, the folder holds a whole step, the previous one or one of a second ago, and a resumed
-run gives the same champion.
+A step is a generation, or an evaluation of the DQN. Steps are saved while the workers are busy, generations once a
+second at most: first their records (`store/steps.py`), then the checkpoint that counts them, then history.csv, from
+which MLflow gets its rows. Whatever kills the process, the folder holds the state after a whole step, either the
+previous one or one of about a second ago, and a resumed run gives the same champion.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from evolution.episodes.figures import summarise
 from gridsim.maps.parts import held_out_place, roads_of, seeds_on
 from gridsim.maps.scenarios import label
 
-WAIT_FOR_MLFLOW_S = 30.0  # at most, for MLflow's id of the run, which summary.json has to hold
+WAIT_FOR_MLFLOW_S = 30.0  # longest wait for MLflow's id of the run, which summary.json is to hold
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a run is computed and logged; no champion depends on it."""
+    """Where a run is computed and logged; no champion depends on it, unless `wall_limit_s` ends the run."""
 
-    workers: int = 0  # Ray workers; 0: in this process, or on a cluster as many as it has free CPUs
-    address: str | None = None  # of a Ray cluster, host:port
-    patience_s: float = 0.0  # time without any worker after which a run stops; 0: as by default (`open_pool`)
-    uri: str = ""  # MLflow's; "": MLflow gets nothing
+    workers: int = 0  # Ray workers; 0: threads of this process, or with an address a worker for each free CPU
+    address: str | None = None  # of a Ray cluster, host:port or auto
+    patience_s: float = 0.0  # how long to wait for a silent worker, or for any worker at all; 0: see `open_pool`
+    uri: str = ""  # MLflow's address; "": MLflow gets nothing
     experiment: str = ""
     wall_limit_s: float = math.inf  # wall-clock budget, including time before a resume; at least one step is done
 
@@ -62,8 +62,8 @@ def train(
     """Train a run to its end, finish it, and send it to MLflow.
 
     Args:
-        on_event: is told what is being done, and warned.
-        on_row: is given the number of steps that are done, and the latest one's row of the history.
+        on_event: called with what is being done, and with warnings.
+        on_row: called after each step, with the number of steps done and the latest one's row of the history.
         initial: a genome to start from, float32 [genes].
         started: time.perf_counter() of the process's start, from which the run's time counts; None: now.
 
@@ -98,7 +98,7 @@ def train(
         raise
     finally:
         if status == "KILLED":
-            with contextlib.suppress(OSError, SystemExit):  # of rich, if the reader of our output has ended
+            with contextlib.suppress(OSError, SystemExit):  # rich raises these if the reader of our output has ended
                 on_event(Event("stopping; a moment ..."))
         if pool:
             pool.close()
@@ -128,7 +128,7 @@ class Session:
     tracking: Tracking
     on_event: Callable[[Event], None]
     on_row: Callable[[int, dict[str, float]], None]
-    started: float  # `perf_counter` at which the run's time began; earlier if it was resumed
+    started: float  # `perf_counter` at the run's start, moved back by the time that a resumed run took before
     wall_limit_s: float
     initial: np.ndarray | None
     summary: dict[str, Any] = field(default_factory=dict)  # what summary.json holds, once it is finished
@@ -181,7 +181,7 @@ class Session:
             self.save()
 
     def save(self) -> None:
-        """Save the steps that are done, once. Raises: CheckpointError; the files before are kept."""
+        """Save the steps done since the last save, if any. Raises: CheckpointError; the old files are kept."""
         if self._state is None:
             return
         (arrays, meta), self._state = self._state, None
@@ -217,7 +217,7 @@ class Session:
         champion.export_onnx(path / ONNX)
         episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, settings.crowds, sim)
         driving = learning.drive("held-out drives", best.genome[None], episodes)
-        self.on_event(next(driving))  # the workers drive, and meanwhile:
+        self.on_event(next(driving))  # the workers drive while the report is written
         write_report(self.run, champion, learning.history, write_elites(path, settings.policy), self.maps.get, episodes)
         driven = finish(driving, self.on_event)
         row, wall, period, roads = learning.history[best.step], self.wall_s(), sim.episode.control_period, self._roads

@@ -34,9 +34,9 @@ from gridsim.step import parameters
 from gridsim.traffic.world import check_traffic
 
 MAX_TRAFFIC = 100
-MAX_STEPS = 10**15  # car-steps or episodes
-SETTLED = 40  # generation from which steps shrink in traffic, by measurement
-LEAST_GROUP = 16  # members of a group, so that its best are good
+MAX_STEPS = 10**15  # largest number that a flag may give for car-steps, generations, episodes and the like
+SETTLED = 40  # generation from which the search's steps shrink in traffic (`SearchConfig.settled`); measured
+LEAST_GROUP = 16  # members that a group should have at least, so that its best ones are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
@@ -108,7 +108,7 @@ class RunSettings(ABC):
 
     @property
     def learner(self) -> str:
-        """Its name in a comparison, which tells apart the two kinds of recombination."""
+        """The learner's name in a comparison. Unlike `algorithm`, it tells apart the two kinds of recombination."""
         return self.algorithm
 
     def simulator(self) -> SimConfig:
@@ -117,7 +117,7 @@ class RunSettings(ABC):
 
     @property
     def crowds(self) -> tuple[int, ...]:
-        """Other cars on each of its roads."""
+        """Number of other cars on each of the scenario's roads."""
         return crowds(self.scenario, self.traffic, self.simulator())
 
     @property
@@ -137,7 +137,8 @@ class RunSettings(ABC):
         if self.pace:
             pace, champion_pace = (self.pace + 1.15 * sim.pace,), (self.pace,)
         metres = {name: getattr(usual, name) * sim.unit for name in ("crash_target", "first_target", "last_target")}
-        rewind = max(round(usual.rewind * 0.1 * sim.pace / sim.episode.control_period), 1)  # of usual steps of 0.1 s
+        # `usual.rewind` counts control steps of 0.1 s.
+        rewind = max(round(usual.rewind * 0.1 * sim.pace / sim.episode.control_period), 1)
         return replace(
             usual, pace=pace, champion_pace=champion_pace, first_maps=usual.first_maps * len(roads),
             **metres, rewind=rewind, slack=usual.slack * sim.pace,
@@ -145,7 +146,10 @@ class RunSettings(ABC):
         )  # fmt: skip
 
     def extending(self, base: RunSettings) -> Self:
-        """These settings for continuing a run of `base`: a default limit is lifted if the user raised another one."""
+        """These settings, changed for continuing a run that had the settings `base`.
+
+        If the user has raised a limit, another limit that is only a default no longer applies.
+        """
         return self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
@@ -153,7 +157,7 @@ class RunSettings(ABC):
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
 
     def check(self) -> None:
-        """Raises GridSimError, one line that says what to change."""
+        """Raises GridSimError if no run can have these settings; its one line says what to change."""
         _check_types(type(self), vars(self))
         check_name(self.scenario)
         sim, roads = self.simulator(), roads_of(self.scenario)
@@ -239,7 +243,7 @@ class EvolveSettings(RunSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "fitness", fitness.absolute(self.fitness))
-        if self.actions == "continuous":  # the policy's text says it wherever a network goes
+        if self.actions == "continuous":  # the policy's text goes wherever the network does, and so has to say it
             object.__setattr__(self, "policy", self.policy.removesuffix(CONTINUOUS) + CONTINUOUS)
 
     def defaults(self) -> dict[str, Any]:
@@ -372,7 +376,7 @@ class DqnSettings(RunSettings):
         self._check_range(0, 1, "discount", "epsilon", "converged")
         self._check_positive("updates", "learning_rate")
         self._check_range(0, 1_000_000, "updates")
-        # A batch or more, and more rows than frames.
+        # The buffer must hold a batch, and more rows than the network sees frames.
         least = max(self.batch, getattr(PolicySpec.parse(self.policy), "frames", 1) + 1)
         self._check_range(least, 10_000_000, "replay")
 

@@ -1,4 +1,4 @@
-"""Stopping is a flag: a signal sets it, and what takes long looks at it where stopping is safe.
+"""Stopping is by a flag: a signal sets it, and code that takes long checks it where stopping is safe.
 
 Ctrl-C, SIGTERM and a closed terminal (SIGHUP) all mean the same: save, and end in seconds. A second signal ends the
 process at once.
@@ -16,7 +16,7 @@ from typing import NoReturn
 INTERRUPTED = 130  # exit code of a command that was stopped
 ONE_SIGNAL_S = 0.5  # signals within this time count as one: `make` and `uv run` repeat what the terminal sends
 _asked_at: float | None = None  # when the first signal came; `time.monotonic`
-_terminals: list[int] = []  # file descriptors that were a terminal
+_terminals: list[int] = []  # standard file descriptors that were a terminal when `listen` was called
 
 
 class Stopped(KeyboardInterrupt):
@@ -24,7 +24,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def listen() -> None:
-    """From now on signals set the flag. Those that the shell or nohup had ignored stay ignored."""
+    """From now on signals set the flag. A signal that a shell or nohup has set to be ignored stays ignored."""
     _terminals[:] = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -61,7 +61,7 @@ def end_at_once() -> NoReturn:
 
 
 def _leave_terminal() -> None:
-    """If the terminal is gone, write to nowhere: an error of writing would keep the run from being saved."""
+    """If the terminal is gone, send output to /dev/null: an error of writing would keep the run from being saved."""
     for descriptor in _terminals:
         if not os.isatty(descriptor):
             os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)

@@ -23,7 +23,7 @@ def km_per_collision(figures: Mapping[str, float]) -> str:
 
 
 def file_name(words: str) -> str:
-    """A scenario's label and other words as a folder's name."""
+    """Words, such as a scenario's label, as the name of a file or folder: other characters become `_`."""
     return re.sub(r"[^\w.+=@-]", "_", words)
 
 

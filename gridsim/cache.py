@@ -23,11 +23,12 @@ _REMEDY = f"set {VARIABLE} to a folder that only you can write to"
 
 
 def cache_folder(name: str) -> Path:
-    """Folder `name` of compiled kernels, made if missing.
+    """The folder `name` for compiled kernels, created if it is missing.
 
-    It is in the first of these that only the user can write to: what `GRIDSIM_CACHE_DIR` or `XDG_CACHE_HOME` names, or
-    else `~/.cache`; the temporary folder; a new folder for this process and its children, removed when the process
-    ends. Warns of the last one, and if the folder that a variable names is not used. Raises: GridSimError without any.
+    It lies in the first of these that only the user can write to: the folder that `GRIDSIM_CACHE_DIR` or else
+    `XDG_CACHE_HOME` names, by default `~/.cache`; a folder of the user in the temporary folder; a new folder for this
+    process and its children, removed when the process ends. A warning is given if the last one is used, or if a folder
+    that a variable names cannot be used. Raises: GridSimError if none of them can be used.
     """
     named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     problems: list[str] = []
@@ -53,16 +54,17 @@ def _in_temporary() -> Path:
 
 def _in_private() -> Path:
     folder = tempfile.mkdtemp(prefix="gridsim-kernels-")
-    # `atexit` would also run it in forks of this process, and not in commands, which skip `atexit` (`entry`).
+    # `atexit` would remove the folder also when a fork of this process ends, but not when a command ends: commands skip
+    # `atexit`, and run the finalizers of `multiprocessing` (`cluster.commands.entry`).
     Finalize(None, shutil.rmtree, [folder], {"ignore_errors": True}, exitpriority=0)
     return Path(folder)
 
 
 def _closed(folder: Path) -> Path:
-    """A folder, made if missing. Raises: OSError if it is a link, or others may change what is in it."""
+    """The folder, created if it is missing. Raises: OSError if it is a link, or others may change what is in it."""
     user = os.geteuid()
     trusted = {user, 0, os.stat("/").st_uid}  # in a container, another user may stand for root
-    for path in (*reversed(folder.parents), folder):  # from the top: below a folder of others, nothing is made
+    for path in (*reversed(folder.parents), folder):  # from the top: nothing is created in a folder of others
         if not os.path.lexists(path):
             with contextlib.suppress(FileExistsError):
                 path.mkdir(mode=0o700)

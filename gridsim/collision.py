@@ -1,4 +1,4 @@
-"""Collisions: with the edge of the road and with other cars, and how close these are."""
+"""Collisions of a car with the edge of the road and with other cars, and distances between cars."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from gridsim.maps.network import wrapped
 from gridsim.maps.roads import THICK_WALL, clearance
 from gridsim.state import COS, LANE, SIN, SPEED, X, Y
 
-# Points on the outline that are checked against an edge without corners, as shares of half length and half width: the
-# car's corners first.
+# Points on a car's outline that are checked where the road's edge has no sharp corners, as shares of the car's half
+# length and half width: the car's corners first.
 _OUTLINE = np.array(
     [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
     dtype=np.float32,
 )
 _OUTLINE.setflags(write=False)
-# m between points of the outline beside thin walls, at least. A wall's corner may reach in by half of it.
+# Least distance (m) between points of the outline that are checked on maps with thin walls. A right-angled corner of a
+# wall that reaches into the car by less than half of it may be missed.
 _OUTLINE_STEP = F(0.1)
 
 
 @leaf
 def _outline_leaves_road(road, length, width, x, y, cosine, sine):
-    """Whether a rectangle's outline leaves the road; length and width are halves (m).
+    """Whether a rectangle's outline leaves the road; `length` and `width` are half its sides (m).
 
-    It goes along each side in steps as long as the clearance, as rays do, so that it misses no corner of a parked car.
+    The check steps along each side by the clearance, but at least by `_OUTLINE_STEP`. So it also finds the corner of a
+    parked car between two corners of the rectangle.
     """
     for _ in range(4):  # the right side from rear to front, then the others counter-clockwise
         x0, y0 = x - length * cosine + width * sine, y - length * sine - width * cosine
@@ -44,11 +46,11 @@ def _outline_leaves_road(road, length, width, x, y, cosine, sine):
 def collides(road, constants, x, y, cosine, sine):
     """Whether any part of the car's outline is off the road.
 
-    On maps with thin walls, it is exact up to the clearance's grid of 0.5 m. On others, no wall has corners as sharp as
-    a parked car's, and it is enough to check twelve points.
+    On maps with thin walls, the whole outline is checked, as exactly as the clearance field is known (at nodes 0.5
+    units apart, `SimConfig.unit`). On others, no wall has corners as sharp as a parked car's: twelve points are enough.
     """
     length, width = constants.half_length, constants.half_width
-    # Two circles cover the car, one each half. If both are clear of the edge, the outline need not be checked.
+    # Two circles cover the car, one for each half. If both are clear of the edge, the outline need not be checked.
     half = HALF * length
     radius = math.sqrt(half * half + width * width)
     front = clearance(road, x + half * cosine, y + half * sine)
@@ -90,7 +92,7 @@ def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 @leaf
 def top_speed_near(world, reach, width, height, x, y):
-    """Top speed (m/s) of a world's cars whose middles are within `reach` m of a point; -1 if there are none."""
+    """Speed (m/s) of the fastest of a world's cars whose middles are within `reach` m of a point; -1 if none is."""
     fastest = -ONE
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO:
@@ -102,7 +104,7 @@ def top_speed_near(world, reach, width, height, x, y):
 
 @leaf
 def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
-    """Whether a car overlaps a car of a world at the place where that was `back` (a share) of a control period ago."""
+    """Whether a car at this pose overlaps one of a world's cars where that was `back` (0 to 1) control periods ago."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO:
             behind = back * dt * world[j, SPEED]
@@ -117,7 +119,7 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
 
 @leaf
 def stands_ahead(constants, world, width, height, x, y, cosine, sine):
-    """Whether a standing car of a world blocks the way close ahead of a car's front."""
+    """Whether one of a world's cars stands in the way of a car, less than `courtesy` m ahead of that car's front."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO and world[j, SPEED] < HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)

@@ -74,7 +74,7 @@ class CacheLocator(UserProvidedCacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> CacheLocator:
-        """Numba's own also tries to write to the folder; `KernelCache` does without a cache if that fails."""
+        """Numba's method also tries to write to the folder. `KernelCache` does without a cache if writing fails."""
         return cls(py_func, py_file)
 
 
@@ -84,7 +84,7 @@ class KernelCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # whatever unpickling of a damaged file raises: compile it, and save it anew
+        except Exception:  # whatever unpickling a damaged file raises: compile and save the kernel anew
             with contextlib.suppress(OSError):
                 self.flush()
             return None
@@ -125,9 +125,9 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
 class Leaf(CPUDispatcher):
     """A kernel that other kernels inline.
 
-    It is compiled without the code that takes arguments from Python's objects (some two hundred numbers for a road),
-    on which a run would spend a third of the time to compile its kernels. The first call from Python compiles a second
-    kernel, which has this code.
+    It is compiled without the code that reads its arguments from Python objects (some two hundred numbers for a road).
+    That code would take a third of the time in which a run compiles its kernels. The first call from Python compiles a
+    second kernel, which has it.
     """
 
     def __call__(self, *arguments: Any) -> Any:
@@ -149,7 +149,7 @@ def leaf(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     use it for a kernel that returns or stores an array.
     """
     kernel = njit(function, forceinline=True, _nrt=False, no_cpython_wrapper=True, **options)
-    if isinstance(kernel, CPUDispatcher):  # else Numba is told to compile nothing
+    if isinstance(kernel, CPUDispatcher):  # under NUMBA_DISABLE_JIT, it is the plain function instead
         kernel.__class__ = Leaf
     return kernel
 

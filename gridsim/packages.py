@@ -9,7 +9,7 @@ from gridsim.errors import GridSimError
 
 #: The name of what pip installs; on PyPI, `gridsim` is another program.
 DISTRIBUTION = "gridsim-driving"
-#: What is imported of each extra of pyproject.toml.
+#: The modules that GridSim imports from each extra of pyproject.toml.
 _EXTRAS = {
     "evolve": "docstring_parser imageio_ffmpeg matplotlib mlflow onnx onnxruntime pygame ray rich torch tyro",
     "roads": "osmium sumo",
@@ -50,7 +50,7 @@ def check_extra(extra: str) -> None:
 
 
 def check_packages() -> None:
-    """Raise GridSimError if the commands and `gridsim.evolve` lack the extra, or a user's file hides a package."""
+    """Raise GridSimError if `cluster`, `evolution` or the extra `evolve` is missing, or if a user's file hides one."""
     for name in _FILES:
         package_folder(name)
     check_extra("evolve")

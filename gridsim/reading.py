@@ -48,7 +48,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def number(value: Any, what: str, low: float, high: float, unit: str = "") -> float:
-    """A number within limits, also from text: YAML 1.1 reads 5e-2 as a string, ROS as a number."""
+    """A number within limits, also if given as text: YAML 1.1 reads 5e-2 as a string, but ROS reads it as a number."""
     try:
         found = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -4,7 +4,7 @@ The reference drives the same path on an empty road. Its speed is limited by cur
 accelerating after them; its steering is the bicycle model's for the path's curvature.
 
 The errors are e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), compared at the
-same place of the route, not at the same time: a delay of a second is not an error for the rest of the drive. Means are
+same place of the path, not at the same time: a delay of a second is not an error for the rest of the drive. Means are
 over metres, so that time at standstill has no weight.
 """
 
@@ -36,7 +36,8 @@ def arc_length(points: np.ndarray) -> np.ndarray:
 def curvature_along(points: np.ndarray, arc: np.ndarray, window: float = WINDOW) -> np.ndarray:
     """Curvature (1/m) at points [n, 2] of a path, from the chords of `window` / 2 m before and after each.
 
-    Near the path's ends it is that of the nearest point with `window` / 4 m on either side. `arc`: their `arc_length`.
+    Near the path's ends, it is the curvature at the nearest point with `window` / 4 m of path on either side. `arc`
+    is the `arc_length` of the points.
     """
 
     def point(s: np.ndarray) -> np.ndarray:
@@ -82,7 +83,7 @@ def profile(
 
 
 class Series(NamedTuple):
-    """A drive and its reference at the same places of a route; float64 [n]."""
+    """A drive and its reference at the same n places of the driven path; float64 [n]."""
 
     arc: np.ndarray  # m driven by the agent, increasing
     speed: np.ndarray  # m/s, the agent's
@@ -121,12 +122,13 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
 def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Series:
     """A drive and the reference's profile along its path, from poses [n, 5] at the control steps (`state.poses_of`).
 
-    Left out are reversing, metres that are driven again, and standing, where steering has no effect; the first 5 m,
-    whose curvature is not known; and the last metres, where the reference might brake for what lies beyond.
+    Left out are reversing, the metres that are driven again after it, and standing, where steering has no effect; the
+    first WINDOW / 2 units, where the curvature is not known; and the last metres, where the reference might brake for
+    what lies beyond.
 
     The reference begins with the agent's speed and ignores traffic. It follows the driven path, whose curvature is
-    averaged over 10 m: if the agent weaves in longer waves, the reference drives them, too, and more slowly. So look at
-    both errors. Raises: ValueError if nothing was driven.
+    averaged over WINDOW units: if the agent weaves in longer waves, the reference weaves, too, but drives more slowly.
+    So the errors of both steering and speed matter. Raises: ValueError if nothing was driven.
     """
     poses = np.asarray(poses, dtype=np.float64)
     steps = road_map.shortest(np.diff(poses[:, :2], axis=0))

@@ -19,8 +19,8 @@ from gridsim.sensing.route import check_lanes
 from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
 
-# Once the atlas has so many maps, adding one removes those without cars. A generated map takes some 2 MB, one from a
-# file up to 70 MB.
+# Once an atlas has this many maps, adding another removes those on which there are no cars. A generated map takes some
+# 2 MB, a map from a file up to 70 MB.
 MOST_MAPS = 256
 
 
@@ -29,7 +29,7 @@ Physics = tuple[Atlas, tuple[Any, ...]]  # several maps, and the `step.parameter
 
 @njit
 def _on_map(physics, row):
-    """The Simulation of a map of the atlas."""
+    """The Simulation of the map in a row of the atlas."""
     return Simulation(road_of(physics[0], row), network_of(physics[0], row), *physics[1])
 
 
@@ -86,7 +86,8 @@ def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, vis
 
     Args: `order` int64 [n], indices of cars, sorted by map; `runs` int64 [maps, 3], for each map its row in the atlas
     and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
-    Writes: `rewards` [n]; `seen`: ranges and closing speeds [n, rays], observations [n, values].
+    Writes, besides the cars' state: `rewards` [n]; `seen`: ranges and closing speeds [n, rays] and observations
+    [n, values].
     """
     for row, first, last in runs:
         simulation = _on_map(physics, row)
@@ -96,7 +97,7 @@ def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, vis
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cars sorted by their maps' rows [n] in the atlas: (order int64 [n], runs int64 [maps, 3]) of `_control_all`."""
-    cars = np.bincount(rows + 1)  # on each map; before its first reset, a car's row is -1
+    cars = np.bincount(rows + 1)  # number on each map; before its first reset, a car's row is -1
     used, last = cars.nonzero()[0], cars.cumsum()
     return rows.argsort(kind="stable"), np.stack([used - 1, (last - cars)[used], last[used]], axis=1)
 
@@ -110,7 +111,7 @@ class Simulator:
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
-        closing: float32 [n, rays], m/s, the closing speeds that go with them; [n, 0] if the features lack `motion`.
+        closing: float32 [n, rays], m/s, closing speeds along the rays; [n, 0] if the features lack `motion`.
         observations: float32 [n, values], what networks see (`sensing.observation`).
     """
 
@@ -156,7 +157,7 @@ class Simulator:
             np.zeros((cars, delays.commands, 2), dtype=np.float32),
         )
         self.maps: dict[int, Map] = {}  # the map of each car that was reset
-        self._row_of: dict[Map, int] = {}  # the maps in the atlas
+        self._row_of: dict[Map, int] = {}  # row of each map in the atlas
         self._rows = np.full(cars, -1)  # row of each car's map in the atlas
         self._groups = _by_map(self._rows)
 
@@ -178,8 +179,8 @@ class Simulator:
 
         Args:
             maps: the map of each car [k], or one for all.
-            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad); or [k, 8], to go on along a
-                route (`state.START_FIELDS`).
+            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad); or [k, 8], to
+                continue a drive (`state.START_FIELDS`).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
         """
@@ -228,7 +229,10 @@ class Simulator:
             yield (self._physics[0], self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
-        """Put cars [k] on maps [k]. Adds new maps to the atlas; if it has MOST_MAPS, maps without cars are removed."""
+        """Put cars [k] on maps [k]. Adds new maps to the atlas.
+
+        If the atlas has MOST_MAPS, or this simulator only one car, maps on which there are no cars are removed then.
+        """
         for each in set(maps):
             check_lanes(each, self.features)
         self.maps.update(zip(cars.tolist(), maps, strict=True))

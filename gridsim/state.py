@@ -23,26 +23,26 @@ CELL = 12  # index of the visit cell the car is in
 FRESH = 13  # 1 if this cell's ground is new
 YAW_RATE, SLIP = 14, 15  # rad/s, and rad between heading and course, of a dynamic vehicle model; else 0
 ROUTE_LANE, ROUTE_ALONG = 16, 17  # the car's place on its route: a lane, and m along it
-ROUTE_KEY = 18  # decides which lanes come after that one, a whole number; 0 without a route
+ROUTE_KEY = 18  # whole number that decides which lanes come after ROUTE_LANE; 0 without a route
 CLOCK = 19  # control steps on the clock of the traffic lights; 0 on a map without lights
 CAR_FIELDS = 20
 
 # Further columns of a car of the traffic.
 LANE = 5  # index of its lane; -1 for an absent car, which is ignored
-ALONG = 6  # m along it
+ALONG = 6  # m along its lane
 NEXT, SECOND_NEXT = 7, 8  # its next two lanes
 JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
-PERMIT = 10  # junction lane that it may enter next; below 0 none: -1 minus the steps that it has stood in a junction
+PERMIT = 10  # junction lane that it may enter next; if none, -1 minus the control steps that it has stood in a junction
 SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
 SPEED_FACTOR = 12  # its desired speed, relative to the lane's
 SEED = 13  # seed of its random turns, below 2 ** 24
-DRAWS = 14  # random numbers drawn so far, one a lane
+DRAWS = 14  # random numbers drawn so far, one for each lane chosen
 ACCELERATION = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to the nearest obstacle
-LEAD_SPEED = 18  # m/s, of that obstacle along its heading
+LEAD_SPEED = 18  # m/s, speed of that obstacle along this car's heading
 LANE_TIMER = 19  # control steps until its next decision on a change of lanes
-SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
+SWAY = 20  # m to the left per m driven, the slope of SHIFT while this changes
 TRAFFIC_FIELDS = 21
 
 # A start has the numbers of a pose: x, y (m), heading (rad), speed (m/s), steering (rad). If the car continues a drive,
@@ -62,7 +62,7 @@ class End(IntEnum):
     COLLISION = 1  # off the road, into a car, or over the stop line of a red light
     IDLE = 2  # too many steps without progress
     SUCCESS = 3  # the target distance is reached
-    TIME = 4  # the time limit
+    TIME = 4  # the time limit is reached
     ASTRAY = 5  # too far from the route
 
 

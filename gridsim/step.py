@@ -1,7 +1,8 @@
 """A control step: traffic moves, the ego car drives, collides, gains new ground or ends its episode, and looks around.
 
 Everything that drives cars is a loop over `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
-In kernels, a world of None means no traffic: Numba then compiles that branch away.
+A `world` is the state of the other cars (`traffic.world`). In kernels, None means that there are none: Numba then
+leaves out the code for traffic.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def visit_cells(road: Road) -> int:
 
 @leaf
 def visit_cell(road, x, y, cosine, sine):
-    """Index of the visit cell of a car on the torus; with `Road.ways` 2, driving back has a cell of its own."""
+    """Index of the visit cell of a car on the torus; if `Road.ways` is 2, each direction of travel has own cells."""
     scale = _VISIT_SCALE * road.per_m
     columns = I(road.width * scale)
     rows = I(road.height * scale)
@@ -135,8 +136,8 @@ def look(simulation, car, world, ranges, closing, observation, history):
     """Sense ranges (m), from the middle of the front axle to the road's edge, a car or a stop line, and observe.
 
     Writes: ranges float32 [rays]; with traffic also closing float32 [rays], the closing speeds of `rays.cast_boxes`,
-    unless it is empty; observation float32 [values]. With a `history`, ranges and closing speeds come late, by the
-    simulation's delays.
+    unless that array is empty; observation float32 [values]. With a `history`, the ranges and closing speeds are those
+    of some control steps ago (`Delays.readings`).
     """
     road, constants, fan = simulation.road, simulation.constants, simulation.fan
     x = car[X] + constants.front_axle * car[COS]

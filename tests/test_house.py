@@ -63,6 +63,12 @@ def test_package_keeps_the_rules_and_its_files_and_folders_stay_small(root: Path
     assert [folder for folder, count in modules.items() if count > MOST_MODULES] == []
 
 
+def test_the_page_on_architecture_names_every_file(root: Path) -> None:
+    page = (root / "docs/architecture.md").read_text(encoding="utf-8")
+    files = [file for package in RANK for file in (root / package).rglob("*.py") if file.name != "__init__.py"]
+    assert [file for file in files if file.name not in page and file.parent.name != "generators"] == []
+
+
 @pytest.mark.parametrize("parts", [99, 2], ids=["files", "rooms"])
 def test_none_import_each_other_in_a_circle(root: Path, parts: int) -> None:
     """Neither at once nor later, nor for types; rooms are a package's folders and the files beside them."""

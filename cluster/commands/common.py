@@ -148,7 +148,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
 
 
 def _names(kind: Any) -> Iterator[str]:
-    """Names of the fields of a command's flags, in groups or not."""
+    """Names of the fields of a command's flags, including those of nested dataclasses."""
     types = get_type_hints(kind)
     for f in dataclasses.fields(kind):
         if dataclasses.is_dataclass(types[f.name]):
@@ -182,7 +182,7 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
 
 
 def select(kind: type[T], flags: Any) -> T:
-    """A `kind` with the values that a command's flags have for its fields."""
+    """An instance of the dataclass `kind`; its fields have the values of the same fields of a command's flags."""
     return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})  # type: ignore[arg-type]
 
 
@@ -197,7 +197,8 @@ def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoRe
 def new_console(stderr: bool = False) -> Console:
     """A console that prints names as they are: brackets and colons in them mean nothing.
 
-    In a notebook (`!gridsim-evolve`), output claims to be a terminal, but a line cannot be written over.
+    In a notebook (`!gridsim-evolve`), output claims to be a terminal, but a line cannot be written over: there the
+    console writes as to a file.
     """
     plain = False if "JPY_PARENT_PID" in os.environ else None  # Jupyter's kernels set it, in Colab, too
     return Console(stderr=stderr, markup=False, emoji=False, force_terminal=plain)
@@ -236,13 +237,13 @@ def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], 
             stream.reconfigure(errors="surrogateescape" if stream.encoding.lower() == "utf-8" else "backslashreplace")
     try:
         sys.exit(body())
-    except KeyboardInterrupt:  # before there was anything to save, or a second one
+    except KeyboardInterrupt:  # after Ctrl-C or a signal, where nothing is left to save
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except GridSimError as error:
         code = FAILED if isinstance(error, WriteError) else WRONG_USE
         fail(prog, str(error), (hints or {}).get(type(error), ""), code)
-    except OSError as error:  # of a path that was only looked at: its name is too long, its folder closed to the user
+    except OSError as error:  # as from `Path.exists`, if a name is too long or a folder may not be read
         if error.filename is None:
             raise
         fail(prog, f"{error.filename}: {error.strerror}")

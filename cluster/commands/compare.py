@@ -69,8 +69,8 @@ QUICK = CompareFlags(seeds=1, budget="10s")
 # Flags that may differ in a resumed comparison.
 MAY_DIFFER = ("resume", "jobs", "workers", "address", "patience", "tracking_uri", "experiment")
 WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
-MAX_JOBS = 256  # each takes some 500 MB here
-WAIT_FOR_MLFLOW_S = 30.0  # for the id of the comparison's run, to which those of its runs belong
+MAX_JOBS = 256  # each takes some 500 MB on this machine
+WAIT_FOR_MLFLOW_S = 30.0  # at most, for the id of the comparison's run in MLflow, the parent of its training runs
 LOOK_S = 0.2  # between two looks at the runs' processes
 
 
@@ -102,7 +102,7 @@ def _compare() -> int:
     common.warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
     shared = {
         "workers": flags.workers, "address": address or "local", "patience": flags.patience,
-        "wall_time": wall_s or MAX_WALL_S,  # with a limit, the time of a run counts from its first step
+        "wall_time": wall_s or MAX_WALL_S,  # with any limit, a run's time counts from its first step
         "tracking_uri": redacted(uri), "experiment": flags.experiment,
     }  # fmt: skip
     stopping.listen()
@@ -126,7 +126,7 @@ def _compare() -> int:
             failed = _train(console, left, total, flags.jobs, wall_s or math.nan, start_run)
         failed += _report(console, path, read_finished(path, plan), plan)
         stopping.check()
-    except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
+    except (KeyboardInterrupt, SystemExit):  # SystemExit is rich's, if the output's reader has ended
         status = "KILLED"
     except (GridSimError, OSError) as error:
         tracking.close("FAILED")
@@ -156,9 +156,10 @@ def _train(
     console: Console, left: Sequence[RunFolder], total: int, jobs: int, run_s: float,
     start: Callable[[RunFolder], Child],
 ) -> int:  # fmt: skip
-    """Train the runs `left` of `total`, `jobs` at a time, until a signal comes; a run that fails stops no other.
+    """Train the runs `left` of `total` ones, `jobs` at a time, until a signal comes; a run that fails stops no other.
 
-    Args: `run_s` is how long a run may take, nan if that is unknown. Returns: how many failed.
+    Args: `run_s`, the wall time (s) that a run may take, nan if not limited; `start`, which starts a run's process.
+    Returns: how many failed.
     """
     waiting, running, failed = deque(left), list[tuple[RunFolder, Child]](), 0
     began = time.perf_counter()
@@ -215,9 +216,9 @@ def _say(text: str) -> None:
 
 
 def _report(console: Console, path: Path, found: Sequence[Run], plan: Plan | None) -> int:
-    """Measure the errors of finished runs, write and print their tables; after a signal, tables without errors.
+    """Measure finished runs' errors against the reference driver, and write and print the runs' tables.
 
-    Returns: how many could not be measured.
+    After a signal, errors are no longer measured. Returns: how many runs could not be measured.
     """
     runs, failed = list[Run](), 0
     with Display(console) as shown:
@@ -236,7 +237,7 @@ def _report(console: Console, path: Path, found: Sequence[Run], plan: Plan | Non
     console.print(tables.introduction(plan))
     for columns in (tables.DRIVING, tables.ERRORS):
         names, *rows = tables.table(groups, columns, spread=False)
-        heads = [name.replace(",", "").replace(" ", "\n") for name in names]  # a word a line, to be narrow
+        heads = [name.replace(",", "").replace(" ", "\n") for name in names]  # a word on each line, for narrow columns
         table = Table(
             *(Column(head, overflow="fold", no_wrap=k < 2) for k, head in enumerate(heads)),
             box=MINIMAL, padding=0, pad_edge=False, show_edge=False,

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from cluster import stopping
 
-STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
+STARTED = time.perf_counter()  # s; some 30 ms, Python's own startup, after the process started
 
 
 def _enter(module: str, name: str) -> None:
@@ -24,7 +24,7 @@ def _enter(module: str, name: str) -> None:
     # collection takes a sixth of their import time.
     gc.set_threshold(200_000, 20, 20)
     if "--version" in sys.argv[1:]:
-        from importlib.metadata import version  # which takes longer than all else until signals are handled
+        from importlib.metadata import version  # only here: it takes longer than all else before signals are handled
 
         from gridsim.packages import DISTRIBUTION
 
@@ -32,7 +32,7 @@ def _enter(module: str, name: str) -> None:
         return
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:  # one that the shell or nohup ignores stays ignored
-            # Until a command has something to save (`stopping.listen`).
+            # A signal ends the process at once, until a command with something to save calls `stopping.listen`.
             signal.signal(number, lambda *_: stopping.end_at_once())
     _settle_environment()
     prog = Path(sys.argv[0]).name
@@ -57,11 +57,11 @@ def _enter(module: str, name: str) -> None:
 
 
 def _settle_environment() -> None:
-    """Change the environment where libraries would fail with it, before there are threads.
+    """Change environment variables with which libraries would fail. To be called before there are threads.
 
-    A notebook's or a user's settings of Matplotlib may keep it from being imported. A process may have no HOME and a
-    user id without a name (OpenShift, HTCondor, systemd): HOME is then a folder that does not exist, as Debian's
-    services have it, so that nothing is written there.
+    Settings of Matplotlib by a notebook or the user are removed, as they may keep it from being imported. A process may
+    have no HOME and a user id without a name (OpenShift, HTCondor, systemd). USER is then set to the id, and HOME to a
+    folder that does not exist, as Debian's services have it, so that nothing is written there.
     """
     for name in ("MPLBACKEND", "MATPLOTLIBRC"):
         os.environ.pop(name, None)

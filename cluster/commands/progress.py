@@ -16,8 +16,8 @@ from cluster.learn.learning import Event
 from cluster.settings import MAX_STEPS, RunSettings
 from cluster.text import count
 
-LINE_S = 5.0  # between lines without a terminal
-WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
+LINE_S = 5.0  # between printed lines, if the output is no terminal
+WINDOW_S = 10.0  # the ETA is computed from the latest steps, which took at least this time
 BAR = 10  # characters
 
 
@@ -26,7 +26,7 @@ class Display(Live):
 
     def __init__(self, console: Console):
         self.head = self.facts = self.rest = ""
-        self.share = 0.0  # that is done, as far as it is known
+        self.share = 0.0  # share of the work that is done, 0 if unknown
         self.began = time.perf_counter()
         super().__init__(console=console, auto_refresh=console.is_terminal, transient=True, get_renderable=self.text)
 
@@ -59,7 +59,7 @@ class RunDisplay(Display):
                 self.console.print(event.text)
 
     def row(self, steps: int, row: Mapping[str, float]) -> None:
-        """Show a step that is done: the number of steps, and the row of the history."""
+        """Show a step that is done, by its row of the history; `steps` is the number of steps done so far."""
         self.share, self.head = progress(self._settings, steps, row)
         self.facts = f"success {row['validation/success_rate']:.0%}"
         if self.share < 1.0:
@@ -72,7 +72,7 @@ class RunDisplay(Display):
             self.console.print(f"{self.head}  {self.facts}  {self._row}", soft_wrap=True)
 
     def _eta(self) -> str:
-        """Time until the run reaches its limit at the pace of the latest steps. It may be solved before."""
+        """Time until the run reaches its limit if steps take as long as the latest ones; it may be solved before."""
         now = time.perf_counter()
         self._steps.append((now, self.share))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
@@ -86,7 +86,7 @@ class RunDisplay(Display):
 def progress(settings: RunSettings, steps: int, row: Mapping[str, float]) -> tuple[float, str]:
     """How far a run is, by the limit that it reaches first: the share (0 without a limit), and what is done, in words.
 
-    Args: the number of its steps, and the latest one's row of the history.
+    Args: `steps`, the number of the run's steps so far; `row`, the latest step's row of the history.
     """
     done = {**row, "generations": steps}
     limits = {name: getattr(settings, name) for name in settings.extendable}
@@ -114,7 +114,7 @@ def row_in_words(settings: RunSettings, steps: int, row: Mapping[str, float]) ->
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds, with hours if there are any; nan is unknown."""
+    """A time as `m:ss`, or `h:mm:ss` from an hour on; `-:--` for nan."""
     if math.isnan(seconds):
         return "-:--"
     minutes, rest = divmod(round(max(seconds, 0.0)), 60)

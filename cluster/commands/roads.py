@@ -66,7 +66,7 @@ def _map() -> int:
 
 
 def _describe(name: str) -> None:
-    """Print what was read from a file."""
+    """Print what a scenario's map or a file holds, and what was noted as a file was read."""
     config = SimConfig()
     here = build(name, 0, config)
     road, network = here.road, here.network

@@ -15,9 +15,9 @@ def driving_table(
     crowds: Sequence[int],
     target: float,
 ) -> Table:
-    """How well a champion drives on held-out maps; of several roads a row for each, with its other cars (`crowds`).
+    """How well a champion drives; with several roads a row for each, with the number of its other cars (`crowds`).
 
-    `target` m without a collision are success.
+    An episode is a success if the champion drives `target` m without a collision.
     """
     if len(roads) == 1:
         return _one_road(title, figures, target)

@@ -12,7 +12,7 @@ from cluster.redaction import one_line
 from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, reach_loopback_directly, unreachable
 from cluster.tracking.database import run_tables
 
-STOP_S = 10.0  # that the server may take to end
+STOP_S = 10.0  # s that the server may take to end
 
 
 def main(port: str) -> None:
@@ -30,13 +30,13 @@ def main(port: str) -> None:
     except Exception as error:  # a database of another MLflow version
         sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}; move it elsewhere if another MLflow made it")
     for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+        if signal.getsignal(number) is not signal.SIG_IGN:  # under nohup, SIGHUP stays ignored
             signal.signal(number, signal.default_int_handler)
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
     server = subprocess.Popen(
         [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
         env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"},
-        process_group=0,  # so that a terminal's signals end it here, with all of its processes
+        process_group=0,  # Ctrl-C reaches only this process, which then ends the whole group
     )
     try:
         while server.poll() is None and unreachable(address):

@@ -17,7 +17,7 @@ PANELS = (
 
 @plain_style()
 def comparison(groups: Groups, path: Path) -> None:
-    """Draw success, velocity error and training time of each road and learner to a PNG.
+    """Draw success, velocity error and time to the champion, for each road and learner, to a PNG.
 
     Bars are medians over seeds, whiskers quartiles, dots the seeds.
     """

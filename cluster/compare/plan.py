@@ -84,12 +84,12 @@ class Plan:
         runs = dataclasses.replace(self, seeds=1).planned(Path())
         if len({run.name for run in runs}) != len(runs):
             raise GridSimError("two runs would have the same name: name all once, also in --grid, or rename a map")
-        # Evolution's settings are checked anyway: the DQN's hold neither --population nor --generations.
+        # Evolution's settings are checked even if only the DQN runs: the DQN's lack --population and --generations.
         for settings in (self.settings(self.scenarios[0], "evolution", 0), *(run.settings for run in runs)):
             settings.check()
 
     def planned(self, folder: Path) -> list[RunFolder]:
-        """All runs of a comparison in that folder, in the order in which they are made; they may not be there yet."""
+        """All runs of the comparison in `folder`, in the order of their training; they may not have begun yet."""
         found = []
         for seed, scenario, learner in itertools.product(range(self.seeds), self.scenarios, self.learners):
             for variant in self.variants(learner):
@@ -125,7 +125,7 @@ class Plan:
             "traffic": self.traffic,
             "seed": seed,
             "observation": self.observation,
-            "until": 1.0,  # equal budgets: a run ends earlier only if its champion succeeds in every validation drive
+            "until": 1.0,  # equal budgets: success ends a run earlier only if it is in every validation drive
             **variant,
         }
         if learner == "dqn":

@@ -47,7 +47,7 @@ def said(run: RunFolder) -> list[tuple[str, str]]:
 
 
 def last_line(run: RunFolder) -> str:
-    """The last line that a run's latest process has printed: its progress, every few seconds."""
+    """The last line that a run's latest process has printed; every few seconds it prints its progress."""
     return _read(run).rstrip("\n").rpartition("\n")[2]
 
 
@@ -57,5 +57,5 @@ def _read(run: RunFolder) -> str:
 
 
 def is_sent(run: RunFolder) -> bool:
-    """Whether MLflow has all of a finished run, as far as its process knew; if not, its command sends the rest."""
+    """Whether MLflow has all of a finished run, by its process's warnings; if not, starting it again sends the rest."""
     return not any("not logged to MLflow" in text for _, text in said(run))

@@ -58,7 +58,10 @@ def page(folder: Path, groups: Groups, plan: Plan | None, drawn: bytes) -> bytes
 
 
 def _table(lines: Sequence[Sequence[str]], runs: Sequence[Sequence[str]] = ()) -> str:
-    """A table as HTML; its first line is the header. With `runs`, these cells, HTML already, replace a line's seeds."""
+    """A table as HTML; its first line is the header.
+
+    Args: `runs`, for each line the cells, already HTML, that replace its third cell (seeds).
+    """
     rows = []
     for k, line in enumerate(lines):
         cells = [escape(cell) for cell in line]

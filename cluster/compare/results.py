@@ -75,7 +75,7 @@ def read_run(folder: Path) -> Run:
 
 
 def measured(run: Run) -> Run:
-    """A run with its ERROR_FIGURES, nan if its champion never drives a metre forward. Raises GridSimError."""
+    """A run with its ERROR_FIGURES, nan if all its champion's drives are too short to compare. Raises GridSimError."""
     road, traffic = run.settings.scenario, run.settings.traffic
     champion, again = load_champion(run.folder / CHAMPION), f"--resume {as_argument(run.folder)}"
     if champion.sha256 != run.champion_sha256:
@@ -90,9 +90,9 @@ def measured(run: Run) -> Run:
 def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: Traffic | None) -> list[Series]:
     """Drives of a champion beside the reference driver, one for each episode, in order; see `gridsim.reference`.
 
-    Episodes in which it does not drive a metre forward are left out.
+    Drives that are too short to compare are left out.
 
-    Args: as for `champion.evaluate`. Raises: GridSimError as it does; Stopped.
+    Args: as for `champion.evaluate`. Raises: GridSimError as `evaluate` does; Stopped.
     """
     sim, episode, spec = champion.sim, champion.sim.episode, PolicySpec.parse(champion.policy)
     limits, found = (episode.target, episode.steps, sim), list[Series]()
@@ -101,6 +101,6 @@ def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic:
             stopping.check()
             road_map = maps[row["map"]]
             _, states, _ = trajectory(spec, champion.genome, road_map, row["start"], *limits, world)
-            with contextlib.suppress(ValueError):  # raised if the car did not drive a metre forward
+            with contextlib.suppress(ValueError):  # raised if the car did not move forward
                 found.append(error_series(poses_of(states), road_map, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

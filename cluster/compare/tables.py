@@ -19,7 +19,7 @@ from gridsim.maps.scenarios import Traffic, label
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
 LIMITS = ("seed", "until", "generations", "car_steps", "episodes")  # settings that may differ within a group
 Groups = dict[tuple[str, str], list[Run]]
-Columns = Mapping[str, tuple[str, float, int]]  # of each column: the figure, its unit's scale, decimal places
+Columns = Mapping[str, tuple[str, float, int]]  # by header: the figure, factor to the column's unit, decimals
 DRIVING: Columns = {
     "success, %": ("success_rate", 100.0, 0),
     "km per crash": ("km_per_collision", 1.0, 1),
@@ -44,14 +44,15 @@ FEW = 3  # seeds; fewer are too few for a verdict
 def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
     """Group runs by the names of their road and learner; with a plan, also its missing runs, which have no figures.
 
-    Names say only what is needed to tell groups apart. A road's has the traffic if this road has several amounts of it.
-    A learner's has the observation if there are both rays and grid, and settings that its runs on this road differ in.
+    Names say only what is needed to tell groups apart. A road's name includes the traffic if its runs have several
+    amounts of it. A learner's name includes the observation if there are both rays and grid, and the settings, except
+    LIMITS, in which its runs on the road differ.
     """
     if plan:
         made = {run.settings: run for run in runs}
         planned = plan.planned(Path())
         runs = [made.get(run.settings) or Run(run.path, run.settings, "", {}) for run in planned]
-    of_learner: dict[tuple[str, Traffic, str, str], list[Run]] = {}  # on a road
+    of_learner: dict[tuple[str, Traffic, str, str], list[Run]] = {}  # on one road
     for run in runs:
         s = run.settings
         of_learner.setdefault((s.scenario, s.traffic, s.learner, s.observation), []).append(run)
@@ -111,7 +112,7 @@ def table_csv(groups: Groups, folder: Path) -> bytes:
 
 
 def table_md(groups: Groups, plan: Plan | None = None) -> bytes:
-    """The plan, two tables, and notes on them."""
+    """The plan, two tables, and notes on them, as Markdown."""
     parts = [introduction(plan)]
     for columns in (DRIVING, ERRORS):
         head, *rows = [[cell.replace("|", "/") for cell in row] for row in table(groups, columns)]
@@ -135,7 +136,7 @@ def notes(groups: Groups) -> list[str]:
 
 
 def introduction(plan: Plan | None) -> str:
-    """The plan in a line."""
+    """The plan in a line; without one, what to know of finished runs."""
     if plan is None:
         return (
             "Finished runs. Their budgets may differ: compare training times and car-steps first. The first run on a "

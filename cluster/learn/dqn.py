@@ -1,9 +1,9 @@
 """The DQN's loop: workers collect a batch of experience while the learner trains on the batches before.
 
-Each batch requires some updates. The learner makes them while the workers collect the next batch, with the weights from
-before these updates, or while they drive validation. So workers and learner do not wait for each other, and the network
-is the same for any number of workers. A step of the run is an evaluation: the averaged network drives the validation
-episodes, as evolution's candidates do.
+Each batch requires some updates. The learner makes them while the workers collect the next batch, or drive validation;
+the weights that drive the next batch are those from before these updates. So workers and learner do not wait for each
+other, and the network is the same for any number of workers. A step of the run is an evaluation: the averaged network
+drives the validation episodes, as evolution's candidates do.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.figures import mean_speed
 
-EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
-BATCH_STEPS = 32_768  # car-steps of a batch, about
-EPISODES = (64, 2048)  # of a batch, at least and at most
+EPISODE_STEPS = 256  # time limit of training episodes, in control steps; they are truncated at it
+BATCH_STEPS = 32_768  # approximate number of car-steps in a batch
+EPISODES = (64, 2048)  # least and greatest number of episodes in a batch
 WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
-STABLE = 3  # evaluations in a row with little change of these, after which the run has converged
+STABLE = 3  # a run has converged after so many evaluations in a row with little change of its Q values
 
 
 @dataclass
@@ -49,9 +49,9 @@ class Dqn(Learning):
     settings: DqnSettings
     batches: int = 0
     episodes: int = 0
-    stable_evaluations: int = 0  # in a row, with little change of the Q values
-    updates_due: float = 0.0  # that the batches so far still require
-    mean_steps: float = 32.0  # of the last batch's episodes
+    stable_evaluations: int = 0  # evaluations in a row with little change of the Q values
+    updates_due: float = 0.0  # updates that the batches so far still require
+    mean_steps: float = 32.0  # mean length of the last batch's episodes, in control steps
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -69,7 +69,7 @@ class Dqn(Learning):
 
     def step(self) -> Progress:
         """Train until the next evaluation is due, and evaluate."""
-        self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
+        self._losses: list[tuple[int, float, float]] = []  # (number of updates, their mean loss, their mean Q)
         steps, rewards = 0, 0.0
         results: list[np.ndarray] = []
         while steps < self.settings.evaluate_every and not (steps and (self.out_of_time() or self.done())):
@@ -135,7 +135,7 @@ class Dqn(Learning):
         return self.updates_due >= 1.0
 
     def candidate(self) -> np.ndarray | None:
-        return self.tried  # each evaluation tries its network
+        return self.tried  # the last evaluation's network, as each evaluation validates its own
 
     def _evaluate_network(self) -> Generator[Event, None, dict[str, float]]:
         """Validate the averaged network. Returns its figures."""
@@ -186,7 +186,7 @@ class Dqn(Learning):
     def state(self) -> State:
         arrays, meta = super().state()
         arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
-        if not self.done() and not self.out_of_time():  # large; an extended run fills a new one
+        if not self.done() and not self.out_of_time():  # the replay is large; a run that is extended fills a new one
             arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
         return arrays, meta

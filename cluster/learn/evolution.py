@@ -24,7 +24,7 @@ from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
 CRASHES = ("crashes", "crash_worlds", "failures")  # the curriculum's arrays in a checkpoint
-AHEAD = 8  # generations for which training maps are built
+AHEAD = 8  # training maps are built for so many generations ahead
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Evolution(Learning):
 
     @property
     def comfort(self) -> bool:
-        return bool(self.settings.fitness)  # a fitness of the user's own may need them
+        return bool(self.settings.fitness)  # a fitness of the user's own may need these figures
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes the worst."""
@@ -85,19 +85,19 @@ class Evolution(Learning):
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.steps + AHEAD)])
 
         members, alone = asked, list[Chunk]()
-        if leader is not None:  # it drives its own episodes, and as a candidate those of validation
+        if leader is not None:  # the leader drives episodes of its own and, if it is promising, those of validation
             followed = curriculum.leader_episodes(self.steps)
             members = asked.and_copies(leader[None])
             row = slice(len(asked.recipes), len(members.recipes))
             for own in (followed, curriculum.validation()) if promising else (followed,):
                 first, episodes = len(episodes.rows), episodes.and_then(own)
                 alone.insert(0, Chunk(row, slice(first, len(episodes.rows))))
-        driven = yield from self._evaluate("evolve", members, episodes, [*alone, *groups])  # the longest first
+        driven = yield from self._evaluate("evolve", members, episodes, [*alone, *groups])  # longest episodes first
         results = np.concatenate([driven.results[part] for part in groups])
         score = self._score(results, goals)
         curriculum.learn_from_members(self.steps, [driven.results[part] for part in groups])
 
-        if leader is None:  # in the first generation, the best member takes its place
+        if leader is None:  # in the first generation, the best member takes the leader's place
             best = int(score.argmax())
             self.elites[self.steps] = self.search.genomes(np.array([best]))[0]
             led, led_score = results[best], float(score[best])
@@ -128,7 +128,7 @@ class Evolution(Learning):
         return self.search.leader()
 
     def _promising(self) -> bool:
-        """Whether to validate the candidate: the leader does well, and validation has not had more than its share."""
+        """Whether to validate the candidate: it is new, recent leaders did well, and validation is within its share."""
         config, candidate = self.curriculum.config, self.candidate()
         latest = [row["leader/success_rate"] for row in self.history[-config.latest :]]
         least = max(config.promising, self.champion.success_rate if self.champion else 0.0)

@@ -30,7 +30,7 @@ from gridsim.config import SimConfig
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
-WAIT_S = 0.2  # at most between two looks at progress
+WAIT_S = 0.2  # longest time between two looks at progress
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Event:
     """Something that a run has to say while it goes on."""
 
     text: str = ""  # what is being done
-    done: int = 0  # of `total` members, or episodes where experience is collected
+    done: int = 0  # how many are done of `total` members, or of `total` episodes of experience
     total: int = 0
     warning: bool = False  # whether the text is a warning
 
@@ -60,9 +60,9 @@ class Champion:
 
 @dataclass
 class Learning(ABC):
-    """One run of a learner, between pool and files."""
+    """One run of a learner: it calls the pool, and holds what is saved in the run's folder."""
 
-    columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
+    columns: ClassVar[tuple[str, ...]]  # columns of history.csv after the step's number, named so in MLflow, too
     checkpointed: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps")
     save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved before the next step changes its arrays
 
@@ -76,8 +76,8 @@ class Learning(ABC):
     history: list[dict[str, float]] = field(default_factory=list)  # a row of figures for each step (`columns`)
     elites: dict[int, np.ndarray] = field(default_factory=dict)  # the network of each unsaved step, float32 [genes]
     car_steps: int = 0
-    validation_steps: int = 0  # how many of these validation took
-    deadline: float = math.inf  # of `time.perf_counter`, at which a long step ends early
+    validation_steps: int = 0  # how many of the car-steps validation took
+    deadline: float = math.inf  # `time.perf_counter` at which learning ends; a long step then ends early
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -96,7 +96,7 @@ class Learning(ABC):
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """How far it has come: the number of its steps by their name, and what the settings' `ended` asks for."""
+        """Counters of the run so far: its steps (under `settings.step_name`), and what `settings.ended` reads."""
 
     @property
     def steps(self) -> int:
@@ -120,7 +120,7 @@ class Learning(ABC):
 
         The champion's score was the best of many on the same maps, by luck as well, so a later candidate that drives
         better may not have reached it. This choice is not in the checkpoint: a run that is extended goes on as if it
-        had never ended. Its car-steps do not count.
+        had never ended. The car-steps of this choice do not count.
         """
         candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
         if candidate is None or self.solved or (before and np.array_equal(candidate, before.genome)):
@@ -135,7 +135,7 @@ class Learning(ABC):
         self.car_steps, self.solved = car_steps, False
 
     def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
-        """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
+        """Make a step's candidate the champion if it is better in validation; `results` are RESULT [1, episodes]."""
         self.tried = candidate
         self.validation_steps += int(results["steps"].sum())
         score, tie_break = self._standing(results)
@@ -144,7 +144,7 @@ class Learning(ABC):
             self.solved = bool(self.curriculum.validation_scores(results[0]).min() >= self.settings.until)
 
     def _standing(self, results: np.ndarray) -> tuple[float, float]:
-        """Score and tie-break, by which champions are compared, of a candidate's validation, RESULT [1, episodes].
+        """Score and tie-break, which rank candidates, from a candidate's results in validation, RESULT [1, episodes].
 
         On several roads the score is success on the worst one: speed on one must not outweigh collisions on others.
         """
@@ -154,7 +154,7 @@ class Learning(ABC):
         return float(success_rate(results.reshape(len(scores), -1)).min()), float(scores.mean())
 
     def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
-        """Wait until a call that the pool has begun is done, and `train`, which is called meanwhile, returns False."""
+        """Wait until the pool has done a call and `train`, called again and again meanwhile, has returned False."""
         warned, busy = 0, True
         yield Event(stage, *call.progress())  # before any training, which changes arrays that the caller may save now
         while self.pool.wait(call, 0.0 if busy else WAIT_S) or busy:
@@ -175,13 +175,13 @@ class Learning(ABC):
         return outcome
 
     def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, tuple[tuple[str, int], ...], SimConfig]:
-        """The first fields of a task, which both kinds have; pools know maps by scenario and seed."""
+        """The fields that both kinds of tasks begin with (`worker._Common`)."""
         return self.settings.policy, episodes.rows, episodes.worlds, self.maps.names(episodes.maps), self.sim
 
     def drive(
         self, stage: str, genomes: np.ndarray, episodes: Episodes, train: Callable[[], bool] = lambda: False
     ) -> Generator[Event, None, Outcome]:
-        """Drive given genomes [n, genes], sent as plain copies. Returns: the call, with its results [n, e]."""
+        """Drive given genomes [n, genes] as they are. Returns: the call, with its results [n, e]."""
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
         return (yield from self._evaluate(stage, copies, episodes, train=train))
 
@@ -192,7 +192,7 @@ class Learning(ABC):
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
 
     def state(self) -> State:
-        """All that an exact resume needs besides the history, arrays and plain numbers."""
+        """All that an exact resume needs besides the history: arrays, and plain numbers by name."""
         champion, none = self.champion, np.zeros(0, dtype=np.float32)
         arrays: dict[str, np.ndarray] = {
             "tried": none if self.tried is None else self.tried,

@@ -27,7 +27,7 @@ class Maps:
                 self._built[seed] = self._thread.submit(build, self._scenario, seed, self.config)
 
     def get(self, seed: int) -> Map:
-        """The map of a seed. One that is still in the queue is built by the caller."""
+        """The map of a seed. If the thread has not begun to build it, the caller builds it."""
         seed = self._seed(seed)
         future = self._built.get(seed)
         if future is None or future.cancel():

@@ -1,1 +1,1 @@
-"""What a run leaves to look at: pictures and films."""
+"""Pictures, pages and films of runs and drives; how champions drive in the suite and under stress."""

@@ -46,7 +46,7 @@ class Recording:
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how the drive ended; RUNNING if the recording was stopped first
     sim: SimConfig  # the simulator's parameters during the drive
-    outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], the network's, if they are known
+    outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], the network's outputs, if known
 
     @property
     def period(self) -> float:
@@ -55,7 +55,7 @@ class Recording:
 
     @cached_property
     def route(self) -> np.ndarray:
-        """Points of its route ahead of each state, m: float32 [steps + 1, points, 2]."""
+        """Points (m) of the car's route ahead of each state: float32 [steps + 1, points, 2]; without a route, none."""
         return points_ahead(self.scenario, self.cars)
 
     @property
@@ -67,9 +67,10 @@ class Recording:
 def record(
     champion: Champion, scenario: Map, start: np.ndarray, seconds: float, world: np.ndarray | None = None
 ) -> Recording:
-    """Drive from `start`, a pose float32 [5] or [8] (`state.START_FIELDS`), to the episode's end, or for `seconds`.
+    """Record a champion's drive from `start` to the episode's end, or until `seconds` have passed.
 
-    Args: world float32 [others, TRAFFIC_FIELDS], the traffic at the start.
+    Args: `start`, a pose float32 [5], or [8] (`state.START_FIELDS`); `world` float32 [others, TRAFFIC_FIELDS], the
+    traffic at the start.
     """
     episode, spec = champion.sim.episode, PolicySpec.parse(champion.policy)
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
@@ -84,16 +85,16 @@ def record(
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:
-    """Poses float32 [steps, others, 4] of other cars: x, y (m), heading (cosine, sine).
+    """Poses float32 [states, others, 4] of the cars that are present in all states: x, y (m), heading (cosine, sine).
 
-    Args: `worlds` float32 [steps, cars, TRAFFIC_FIELDS]. Cars that are absent at any step are left out.
+    Args: `worlds` float32 [states, cars, TRAFFIC_FIELDS]. A car that is absent in any state is left out of all.
     """
     return worlds[:, (worlds[:, :, LANE] >= 0.0).all(axis=0), :4]
 
 
 def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "") -> np.ndarray:
-    """The picture uint8 [h, w, 3] of a drive at a time since its start."""
-    from gridsim.view.render import interpolate  # imports SciPy, which the report does not need
+    """Draw a drive `seconds` after its start, interpolated between states: a picture uint8 [h, w, 3]."""
+    from gridsim.view.render import interpolate  # imported here, as `write_report` needs no renderer
 
     at = min(max(seconds / drive.period, 0.0), len(drive.cars) - 1.0)
     k = min(int(at), len(drive.cars) - 2) if len(drive.cars) > 1 else 0
@@ -102,7 +103,7 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
     car = interpolate(drive.cars[k], drive.cars[following], part, drive.scenario)
     boxes = interpolate(drive.boxes[k], drive.boxes[following], part, drive.scenario) if drive.boxes.shape[1] else None
     ranges, then = drive.ranges[k], drive.ranges[following]
-    # A ray that jumps from one object to another is shown on either, never between them.
+    # A ray that jumps from one object to another is shown on one of the two, never between them.
     ranges = np.where(np.abs(then - ranges) < 3.0, ranges + part * (then - ranges), ranges if part < 0.5 else then)
     path = np.concatenate([drive.cars[: k + 1, [X, Y]], car[None, [X, Y]]])
     minutes, rest = divmod(min(seconds, drive.seconds), 60)

@@ -1,8 +1,9 @@
 """The drive's page: one HTML file that plays drives in any browser, offline.
 
-Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel;
-the differences between moments are compressed. Positions are in 65,536ths of the map's sides and headings in
-65,536ths of a turn, so that both wrap as the torus and the angle do. Lengths are in units (`SimConfig.unit`).
+Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel,
+one column per moment; the differences from each moment to the next are compressed. Positions are in 65,536ths of the
+map's sides and headings in 65,536ths of a turn, so that both wrap as the torus and the angle do. Lengths are in units
+(`SimConfig.unit`), but speeds in m/s and the distance driven in m.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Shown:
         ]
         for k in range(boxes.shape[1]):
             channels += _place(boxes[:, k], size)
-        rays, outputs, middle = 0, list[str](), 0  # middle: % of a bar's length at which an output of 0 is drawn
+        rays, outputs, middle = 0, list[str](), 0  # middle: % of a bar's length from which it is filled
         if self.stride == 1:
             rays = drive.ranges.shape[1]
             channels += [ray * 100.0 / float(road.unit) for ray in drive.ranges.T]
@@ -70,7 +71,7 @@ class Shown:
                 shares = drive.outputs
                 if shares.shape[1] == len(COMMAND):
                     outputs, middle = COMMAND, 50
-                    shares = 0.5 + shares * [0.5, -0.5]  # a bar to the left is a wheel to the left
+                    shares = 0.5 + shares * [0.5, -0.5]  # wheel to the left: bar to the left
                 else:
                     outputs, low, high = ACTIONS, shares.min(axis=1, keepdims=True), shares.max(axis=1, keepdims=True)
                     shares = (shares - low) / np.maximum(high - low, 1e-9)
@@ -94,7 +95,7 @@ class Shown:
 
 
 def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
-    """Channels x, y and heading of cars [n, 4 or more]: x, y (m), heading (cosine, sine)."""
+    """Channels x, y and heading of one car from its states [n, 4 or more]: x, y (m), heading (cosine, sine)."""
     x, y, cosine, sine = cars[:, :4].T.astype(float)
     return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
 
@@ -119,9 +120,9 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = 
         "car": [last.sim.vehicle.length / unit, last.sim.vehicle.width / unit],
         "sensor": float(constant.front_axle) / unit,
         "fan": [float(constant.ray_first), float(constant.ray_step)],
-        # Centre x, y (m) and half of the dash dx, dy (m).
+        # Each dash: its centre x, y, and the vector dx, dy from there to its end (units).
         "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
-        # Stop lines: as marks, and for each second the number of the colour that the light shows.
+        # Each stop line: centre and vector as for the dashes, and a digit for the colour of its light in each second.
         "lights": [
             [round(n, 2) for n in (x, y, -half * sine, half * cosine)] + ["".join(map(str, program))]
             for (x, y, cosine, sine, half), program in zip(lines, programs, strict=True)

@@ -1,4 +1,4 @@
-"""The pictures of a run: its curves, and the path of a drive."""
+"""Pictures of the curves of a run, the path of a drive, and the lanes of a map."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _ROAD, _WALL = "#4a4e57", "#e9efe6"
 
 @contextlib.contextmanager
 def plain_style() -> Iterator[None]:
-    """Matplotlib's defaults, whatever the user's matplotlibrc says, and names as they are: `$` begins no formula."""
+    """A context in which Matplotlib has its defaults, whatever the user's matplotlibrc says, and draws `$` as it is."""
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # else it warns where the home folder cannot be written to
     import matplotlib
 
     style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "text.parse_math": False}
     del style["backend"]  # takes 0.8 s to load
-    # Left in place: restoring Python's filters would also undo what another thread has set meanwhile.
+    # This filter is left in place: restoring Python's filters would also undo what another thread has set meanwhile.
     warnings.filterwarnings("ignore", "Glyph .* missing from font")
     with matplotlib.rc_context(style):
         yield
@@ -49,7 +49,7 @@ def figure_of(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
 
 @plain_style()
 def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -> None:
-    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
+    """Draw fitness (DQN: Q values, loss), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = figure_of(15, 3.8, 4)
     step = np.arange(len(history))
 
@@ -89,7 +89,7 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
 def bounds(road_map: Map) -> list[float]:
     """The part of a map that is shown, in m: left, right, low, high.
 
-    A map from a file is shown around its road, since its sides are rounded up to powers of two, with wall.
+    Of a map from a file this is the part around its road: the map is filled up with wall to sides of powers of two.
     """
     width, height = float(road_map.road.width), float(road_map.road.height)
     if road_map.torus and len(road_map.strips.lines):
@@ -113,7 +113,7 @@ def _ground(axis: Any, scenario: Map, title: str) -> None:
 
 @plain_style()
 def road_map(scenario: Map, path: Path, title: str) -> None:
-    """Draw a map and its lanes to a PNG: arrows in driving direction, red where lanes cross or merge; stop lines."""
+    """Draw a map with its stop lines and lanes to a PNG: arrows show the direction, red lanes cross others or merge."""
     from matplotlib.collections import LineCollection
 
     figure, (axis,) = figure_of(12.0, 11.0)

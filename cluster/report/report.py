@@ -17,7 +17,7 @@ from gridsim.maps.parts import is_map_file
 from gridsim.maps.scenarios import label
 from gridsim.state import DISTANCE
 
-ELITES_SHOWN = 24  # at most, beside the champion on the page; early ones mostly, as they show the learning
+ELITES_SHOWN = 24  # elites on the page at most, besides the champion; mostly early ones, which show the learning
 
 
 def write_report(
@@ -28,10 +28,10 @@ def write_report(
     get_map: Callable[[int], Map],
     episodes: Episodes,
 ) -> None:
-    """Write curves.png (the history), trajectory.png (the champion's drive), drive.html (its drive, and elites').
+    """Write curves.png (history), trajectory.png (champion's drive) and drive.html (champion's and elites' drives).
 
-    All drives are in one episode, the last road's first one in `episodes`, which are the held-out ones. Args:
-    `history`, its rows; `elites`, the network of each step, float32 [steps, genes]; `get_map`, a map by its seed.
+    All drives are of one episode, the last road's first one in `episodes`. Args: `history`, its rows; `elites`, the
+    network of each step, float32 [steps, genes]; `get_map`, a map by its seed; `episodes`, the held-out ones.
     """
     path, settings, limit = run.path, run.settings, champion.sim.episode.time_limit
     row = len(episodes.rows) - len(episodes.rows) // len(settings.crowds)

@@ -16,16 +16,16 @@ PICTURE = "stress.png"
 
 
 class Stress(NamedTuple):
-    """One thing that gets worse: the number `name` in a part of the configuration, level by level."""
+    """One thing that gets worse level by level: the number `name` in a `part` of SimConfig, such as its sensors."""
 
     label: str
     part: str
     name: str
     levels: tuple[float, ...]
-    share: bool = False  # whether levels are shares of the champion's own number
+    share: bool = False  # whether levels are factors on the champion's own number
 
     def at(self, level: float, sim: SimConfig) -> SimConfig:
-        """A configuration in which this number is at a level."""
+        """The configuration `sim` with this number set to a level."""
         part = getattr(sim, self.part)
         value = level * getattr(part, self.name) if self.share else level
         return dataclasses.replace(sim, **{self.part: dataclasses.replace(part, **{self.name: value})})
@@ -62,7 +62,7 @@ def drive(
 
 @plain_style()
 def draw(found: Sequence[tuple[Stress, float, dict[str, float]]], title: str, path: Path) -> None:
-    """Draw success against each stress to a PNG."""
+    """Draw success against the level of each stress to a PNG; `found` as `drive` yields it."""
     chosen = list(dict.fromkeys(stress for stress, _, _ in found))
     figure, axes = figure_of(3.0 * len(chosen), 3.2, len(chosen))
     for axis, stress in zip(axes, chosen, strict=True):

@@ -1,6 +1,7 @@
-"""The suite: fixed drives in which anybody's champions are compared, and a digest by which their figures are checked.
+"""The suite: fixed drives in which anybody's champions are compared, and a digest of the drives to check figures by.
 
-Figures of one NUMBER can be compared: whoever changes roads, traffic, car or the number of drives increases it.
+Only figures of the same NUMBER can be compared. Whoever changes the suite's roads, traffic, car or number of drives
+increases NUMBER.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def report(champion: Champion, driven: list[tuple[str, int, np.ndarray]]) -> dic
 
 
 def earlier(path: Path) -> dict[str, Any]:
-    """Suite, champion and digest of a suite.json; an empty dictionary if there is none. Raises: CheckpointError."""
+    """NUMBER, champion's digest and drives' digest from a suite.json; {} if there is none. Raises: CheckpointError."""
     try:
         found = json.loads(path.read_bytes())
         return {name: found[name] for name in ("suite", "champion_sha256", "digest")}

@@ -30,13 +30,13 @@ from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, roads_of, seed_of_map
 from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name
 
-SIM_FORMAT = 2  # of a champion's `sim`; in format 1, patience and progress counted control steps, not seconds
-GONE = ("apart", "kerb")  # parameters of traffic that no longer exist, in champions of the first format
+SIM_FORMAT = 2  # of a champion's `sim`; format 1 had patience in control steps, and progress in m per control step
+GONE = ("apart", "kerb")  # traffic parameters of format 1 that no longer exist
 
 
 @dataclass(frozen=True)
 class Champion:
-    """A genome and what is needed to run it. Champions are equal if all of that is, the genome bit for bit."""
+    """A genome and what is needed to run it. Champions are equal if all fields are, the genome bit for bit."""
 
     genome: np.ndarray  #: float32 [genes]
     policy: str  #: its network, such as `mlp:6,7`
@@ -61,7 +61,7 @@ class Champion:
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
 
     def in_sim(self, sim: SimConfig | str | None) -> Champion:
-        """The champion in another car or with other sensors, if given (`SimConfig.load`). Raises GridSimError."""
+        """The champion with other simulator parameters (as for `SimConfig.load`), if given. Raises GridSimError."""
         other = dataclasses.replace(self, sim=SimConfig.load(sim)) if sim else self
         rollout.policy_buffers(PolicySpec.parse(self.policy), other.sim)  # raises if the rays do not fit the network
         return other
@@ -69,8 +69,8 @@ class Champion:
     def crowds_on(self, scenario: str, asked: Traffic | None = None) -> tuple[int, ...]:
         """The number of other cars on each road of a scenario.
 
-        By default as it learned, if it learned on all of these roads in a car of usual size (`SimConfig.unit` is 1);
-        else each road's default.
+        By default as many as the champion learned among, if it learned on all of these roads and its present car has
+        the usual size (`SimConfig.unit` is 1); else the scenario's default.
         """
         if asked is None and self.sim.unit == 1.0 and {*roads_of(scenario)} <= {*roads_of(self.scenario)}:
             asked = self.traffic
@@ -79,10 +79,11 @@ class Champion:
     def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> Any:
         """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
 
-        An action is a number, or of a continuous policy float32 [2], pedal and wheel, each in [-1, 1].
+        An action is an integer (`vehicle.Action`), or for a continuous policy float32 [2]: pedal and wheel, each in
+        [-1, 1].
 
         Args: with rays, float32 [32] or [n, 32], or more numbers if the policy sees more; with the grid, a dictionary:
-        grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed.
+        grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed, float32 [1] or [n, 1].
         Raises: ValueError, with a one-line message, for an observation that does not fit this champion.
         """
         spec = PolicySpec.parse(self.policy)
@@ -115,7 +116,7 @@ class Champion:
         checkpoint.save(path, {"genome": self.genome}, meta | sim)
 
     def export_onnx(self, path: str | os.PathLike[str]) -> None:
-        """Write an ONNX file from the environment's observations to actions (docs/deploy.md).
+        """Write the policy as an ONNX file, which maps the environment's observations to actions (docs/deploy.md).
 
         Raises: GridSimError if the package onnx is not installed, CheckpointError if the file cannot be written.
         """
@@ -158,7 +159,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
 
 
 def _in_seconds(sim: dict[str, Any]) -> dict[str, Any]:
-    """A champion's `sim` of the first format, converted to the present one."""
+    """Convert a champion's `sim` of format 1 to SIM_FORMAT: patience in s, progress in m/s, and no parameters GONE."""
     episode, period = sim["episode"], sim["episode"]["control_period"]
     episode = episode | {"patience": episode["patience"] * period, "progress": episode["progress"] / period}
     traffic = {name: value for name, value in sim.get("traffic", {}).items() if name not in GONE}
@@ -166,7 +167,7 @@ def _in_seconds(sim: dict[str, Any]) -> dict[str, Any]:
 
 
 def _missing(run: Path) -> CheckpointError:
-    """Why a folder has no champion, and what to do."""
+    """The error for a folder without a champion: its message says why there is none, and what to do."""
     if not (run / CONFIG).is_file():
         return CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
     command = read_config(run / CONFIG)[0].command
@@ -184,14 +185,14 @@ def evaluate(
     traffic: Traffic | None = None,
     sim: SimConfig | str | None = None,
 ) -> dict[str, float]:
-    """Drive a champion through episodes on maps it never saw, in this process.
+    """Drive a champion through episodes, by default held-out ones, in this process.
 
     Args: `scenario`, a name (default: the champion's own), also of several roads; `episodes` on each road; `seed` of
     the first map; `traffic`, other cars, usual, heavy or a number (default: as many as it learned among, or as another
     scenario has by default); `sim`, what `SimConfig.load` takes (default: the simulator's numbers it learned with).
-    Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means), km_per_collision. With the defaults
-    these are the held-out figures of summary.json.
-    Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.
+    Returns: the number of episodes; success_rate, distance_m, speed_mps and collision_rate, which are means;
+    km_per_collision. With the defaults these are the held-out figures of summary.json.
+    Raises: GridSimError (a ValueError) for an unknown scenario or fewer than one episode.
     """
     champion = champion.in_sim(sim)
     found = [results for _, _, results in drives(champion, scenario, episodes, seed, traffic)]
@@ -201,7 +202,7 @@ def evaluate(
 def drives(
     champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: Traffic | None
 ) -> Iterator[tuple[str, int, np.ndarray]]:
-    """The drives of `evaluate`, road by road. Yields: the road, the number of other cars, and RESULT [episodes]."""
+    """Drive `evaluate`'s episodes, road by road. Yields: the road, its number of other cars, and RESULT [episodes]."""
     spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
     for road, cars, chosen, maps in held_out(champion, scenario, episodes, seed, traffic):
         yield road, cars, rollout.evaluate(spec, genomes, maps, chosen.rows, sim, chosen.worlds)[0][0]
@@ -210,9 +211,9 @@ def drives(
 def held_out(
     champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: Traffic | None
 ) -> Iterator[tuple[str, int, Episodes, list[Map]]]:
-    """The episodes that `evaluate` drives, road by road. Yields: the road, other cars, episodes, and their maps.
+    """The episodes that `evaluate` drives. Yields for each road: its name, number of other cars, episodes and maps.
 
-    Raises: GridSimError as it does.
+    Raises: GridSimError as `evaluate` does.
     """
     name = full_name(scenario or champion.scenario)
     check_name(name)

@@ -20,9 +20,9 @@ from cluster.redaction import one_line
 from gridsim.errors import GridSimError
 
 CONFIG, CHECKPOINT, STEPS, HISTORY = "config.json", "checkpoint.npz", "steps.bin", "history.csv"
-"""Files of a run's folder from its beginning."""
+"""Files of a run's folder: config.json from the start, the others from the first saved step on."""
 MLFLOW = "mlflow.json"
-"""Where MLflow has the run; only `cluster.tracking` reads and writes it."""
+"""File that says where MLflow has the run; only `cluster.tracking` reads and writes this file."""
 CHAMPION, ELITES, SUMMARY = "champion.npz", "elites.npz", "summary.json"
 """Files of a finished run."""
 
@@ -85,7 +85,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
     """Replace the file at `path` with `content`, flushed to the disk, or leave it as it was and raise WriteError."""
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")  # a writer that is killed leaves it, until the next one writes
+    temporary = path.with_name(f".{path.name}.tmp")  # left behind by a killed process, until the next write
     try:
         with open(temporary, "wb") as file:
             file.write(content)

@@ -31,9 +31,9 @@ from gridsim.packages import DISTRIBUTION
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
 FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, ELITES, HISTORY, ONNX, PAGE, STEPS, SUMMARY, TRAJECTORY)
-"""Files of a finished run, which MLflow gets; what else is in its folder is the user's own."""
+"""Files of a finished run that MLflow gets. Others in its folder, such as the user's own, are not sent."""
 BEGUN = {CONFIG, STEPS, MLFLOW}
-"""Files of a run that was stopped before its first step was saved."""
+"""Files that a run's folder may hold before the run's first step is saved."""
 CONFIG_FORMAT = 3
 
 
@@ -48,7 +48,7 @@ class RunFolder:
     path: Path
     settings: RunSettings  # what decides its champion
     init: str = ""  # path of the champion it started from
-    init_sha256: str = ""  # digest of that genome
+    init_sha256: str = ""  # digest of that champion's genome
     saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None  # its checkpoint, if it is resumed
 
     @property
@@ -84,7 +84,7 @@ class RunFolder:
 
 
 def read_config(path: Path) -> tuple[RunSettings, str]:
-    """Settings of either learner and the initial champion's path from a run's config.json. Raises RunError."""
+    """A run's settings, and the path of its initial champion or "", from its config.json. Raises RunError."""
     try:
         config = json.loads(path.read_bytes())
         if config["format"] != CONFIG_FORMAT:
@@ -104,7 +104,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
 
 
 def _sources(settings: RunSettings) -> dict[str, str]:
-    """Digests of the user's files that a run depends on: its map's and its fitness's. Raises GridSimError."""
+    """Digests of the user's files that a run depends on, if any: maps and a fitness function. Raises GridSimError."""
     found = {}
     if digest := map_digest(settings.scenario):
         found["map_sha256"] = digest
@@ -113,7 +113,7 @@ def _sources(settings: RunSettings) -> dict[str, str]:
     return found
 
 
-@functools.cache  # a process that has locked a folder may call this again
+@functools.cache  # a second call for a folder that is locked already does nothing
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
     try:
@@ -129,7 +129,7 @@ def lock(path: Path) -> None:
 
 
 def open_run(folder: Path) -> RunFolder:
-    """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError, CheckpointError."""
+    """Lock the folder of a run that is to be resumed, then read and check its checkpoint. Raises RunError."""
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
     path = folder.resolve()
@@ -183,6 +183,6 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether nothing is left to do: learning has ended by these settings, and all files are there."""
+    """Whether nothing is left to do: learning has ended by the run's settings, and champion and summary are there."""
     there = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION))
     return run.saved is not None and there and run.settings.ended(run.saved[1])

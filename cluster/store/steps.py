@@ -21,9 +21,9 @@ from evolution.networks.policy import PolicySpec
 
 
 class Steps:
-    """The steps of a run that this process adds to.
+    """The saved steps of a run, to which this process adds.
 
-    Args: the run's `folder`; `step_name`, what a step is called; the history's `columns`; `genes` of a genome.
+    Args: the run's `folder`; `step_name`, what a step is called; the history's `columns`; `genes`, a genome's size.
     """
 
     def __init__(self, folder: Path, step_name: str, columns: Sequence[str], genes: int):
@@ -41,7 +41,7 @@ class Steps:
         return records["row"]
 
     def append(self, rows: np.ndarray, elites: Sequence[np.ndarray]) -> None:
-        """Add steps: rows float64 [n, columns] and elites [n] float32 [genes]. They are on the disk when this returns.
+        """Add n steps: rows float64 [n, columns] and n elites, each float32 [genes]. Returns once they are on the disk.
 
         Raises: WriteError; the steps before are kept.
         """
@@ -59,30 +59,30 @@ class Steps:
         self.number += len(new)
 
     def write_history(self, rows: np.ndarray) -> None:
-        """Write history.csv with further rows, float64 [n, columns]. Raises: WriteError."""
+        """Write history.csv anew: the earlier rows and then `rows`, float64 [n, columns]. Raises: WriteError."""
         for row in rows.tolist():
             self._history.append(",".join([str(len(self._history) - 1), *map(repr, row)]))
         checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode())
 
 
 def read_history(folder: Path) -> list[dict[str, float]]:
-    """The rows of history.csv. Raises: OSError."""
+    """The rows of history.csv, each as figures by column, without the step's number. Raises: OSError."""
     with open(folder / HISTORY, newline="") as file:
         (_, *columns), *rows = csv.reader(file)
     return [dict(zip(columns, map(float, row[1:]), strict=True)) for row in rows]
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:
-    """The network of each step of a run, going on or ended, float32 [steps, genes] of that policy.
+    """The network of each saved step of a run, which may still be going on: float32 [steps, genes].
 
-    Raises: CheckpointError.
+    Args: `policy`, the run's. Raises: CheckpointError.
     """
     meta = checkpoint.load(folder / CHECKPOINT)[1]
     return _read(folder, meta, _record(len(meta.get("columns", ())), PolicySpec.parse(policy).size))["elite"]
 
 
 def write_elites(folder: Path, policy: str) -> np.ndarray:
-    """Write elites.npz, which holds `genomes` float32 [steps, genes]. Returns: these. Raises: CheckpointError."""
+    """Write elites.npz, which holds `genomes` float32 [steps, genes]. Returns: `genomes`. Raises: CheckpointError."""
     genomes = np.ascontiguousarray(read_elites(folder, policy))
     checkpoint.save(folder / ELITES, {"genomes": genomes}, {"policy": policy})
     return genomes
@@ -93,7 +93,7 @@ def _record(columns: int, genes: int) -> np.dtype:
 
 
 def _read(folder: Path, meta: Mapping[str, Any], record: np.dtype) -> np.ndarray:
-    """The records that a checkpoint with this `meta` counts. Raises: CheckpointError if the file lacks them."""
+    """The records that a checkpoint with this `meta` counts. Raises: CheckpointError if steps.bin has fewer."""
     path, number = folder / STEPS, meta.get("steps", 0)
     try:
         with open(path, "rb") as file:

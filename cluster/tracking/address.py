@@ -1,6 +1,6 @@
 """Tracking addresses: checked, made absolute, and shown without secrets. Does not import MLflow.
 
-An address is probed before MLflow is imported: with a dead one MLflow would hang for minutes.
+A server is probed here before MLflow is used: where no server answers, MLflow would hang for minutes.
 """
 
 import contextlib
@@ -21,12 +21,12 @@ from cluster.redaction import UNCLEAR, one_line, redacted
 from gridsim.errors import GridSimError
 
 DEFAULT_URI = "sqlite:///mlflow.db"
-UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
-VIEW = "gridsim"  # the saved view of an experiment in MLflow's UI
+UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` serve MLflow's UI by default
+VIEW = "gridsim"  # key of the view that is saved with each experiment for MLflow's UI
 PROBE_S = 3.0
 _SERVERS = ("http", "https")
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
-_HOSTED = "databricks"  # a scheme of MLflow's own; others come with plug-ins
+_HOSTED = "databricks"  # MLflow's own scheme for a hosted store; plug-ins add other schemes
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 _PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # a request that gateways in front of MLflow pass on, too
 _SQLITE = re.compile(r"sqlite(\+\w+)?:///(.+?)(?:\?([\w.-]+=[^/]*))?", re.IGNORECASE | re.DOTALL)
@@ -38,13 +38,14 @@ class TrackingError(GridSimError):
 
 
 def check_uri(uri: str | None = None, begun_with: str = "") -> str:
-    """The tracking address made absolute and probed, without MLflow.
+    """The tracking address to use, made absolute and probed, without MLflow.
 
-    If `uri` is None or "": the address `begun_with` of a resumed run, else MLFLOW_TRACKING_URI, else DEFAULT_URI. A
-    password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI. A server is not probed for a
-    resumed run or a comparison's run (MLFLOW_RUN_CONTEXT is set), which go on without it; a hosted store never is.
-    Raises TrackingError for a server that does not answer, a database that cannot be written or is another MLflow's, a
-    folder (MLflow 3 stores nothing in folders) and anything unknown.
+    It is `uri`; if that is None or "", `begun_with` (the address of a resumed run), else MLFLOW_TRACKING_URI, else
+    DEFAULT_URI. If MLFLOW_TRACKING_URI is the same address with a password, this is added, so that no file and no flag
+    needs to hold it. A server is not probed if `begun_with` is used or in a comparison's run (MLFLOW_RUN_CONTEXT is
+    set): such runs go on without it. A hosted store is never probed. Raises TrackingError for a server that does not
+    answer, a SQLite database that cannot be written or that another version of MLflow made, a folder (MLflow 3 stores
+    nothing in folders), and an unknown scheme.
     """
     reach_loopback_directly()
     probed = (not uri and bool(begun_with)) or "MLFLOW_RUN_CONTEXT" in os.environ
@@ -68,12 +69,12 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
 
 
 def unreachable(uri: str) -> str:
-    """Why the server of an address, MLflow's or a database's, does not answer now; "" for all other addresses."""
+    """Why the MLflow or database server at an address does not answer now; "" if it does, or if there is no server."""
     scheme = address_scheme(uri)
     if scheme in _SERVERS:
         return _server_problem(redacted(uri))
     if scheme in _DATABASES:
-        parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
+        parts = urllib.parse.urlsplit(redacted(uri))  # no password, in which a colon would be taken for the port's
         try:
             if parts.hostname:  # an address without a host is a Unix socket's
                 socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
@@ -109,7 +110,7 @@ def address_scheme(uri: str) -> str:
 
 
 def is_database(uri: str) -> bool:
-    """Whether an address is a database's that MLflow opens in this process, not a server's."""
+    """Whether an address names a database, which MLflow opens in this process, and not an MLflow server."""
     return address_scheme(uri) in ("sqlite", *_DATABASES)
 
 
@@ -119,13 +120,13 @@ def is_locked(error: str | None) -> bool:
 
 
 def with_password(saved: str) -> str:
-    """An address of a file or a flag, with the user and password that MLFLOW_TRACKING_URI may have for it."""
+    """`saved`, an address from a file or a flag; with user and password if MLFLOW_TRACKING_URI has them for it."""
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
     return usual if redacted(usual) == redacted(saved) and not saved.endswith(UNCLEAR) else saved
 
 
 def reach_loopback_directly() -> None:
-    """Except this machine from the proxies that the environment names: no proxy would reach its loopback addresses.
+    """Exclude loopback addresses from the proxies that the environment names: no proxy can reach this machine's.
 
     To be called before there are threads, as it changes the environment.
     """
@@ -135,7 +136,10 @@ def reach_loopback_directly() -> None:
 
 
 def _check_sqlite(uri: str) -> str:
-    """The address with an absolute path. Raises TrackingError if the database, or its folder, cannot be written."""
+    """A SQLite address with an absolute path.
+
+    Raises TrackingError if the database or its folder cannot be written, or another version of MLflow made it.
+    """
     path, shown = sqlite_path(uri), redacted(uri)
     if path is None or path.is_dir():
         raise TrackingError(f"{shown}: names no file; use {DEFAULT_URI}")
@@ -169,17 +173,18 @@ def sqlite_path(uri: str) -> Path | None:
 def sqlite_uri(path: Path, query: str | None = None) -> str:
     """The SQLite address of an absolute path.
 
-    SQLAlchemy takes a question mark for the beginning of a query, and decodes %3F and the like; so both marks are
-    encoded. MLflow would create folders with the encoded names, unless the address also names the driver.
+    SQLAlchemy takes a question mark for the beginning of a query, and decodes %3F and the like; so ? and % in the path
+    are encoded. MLflow would create folders with the encoded names, unless the address also names the driver.
     """
     text = str(path).replace("%", "%25").replace("?", "%3F")
     return f"sqlite{'+pysqlite' if text != str(path) else ''}:///{text}" + (f"?{query}" if query else "")
 
 
 def schema_problem(revision: str | None, uri: str) -> str:
-    """Why a database of this schema is not used, in one line, or "".
+    """Why a database with this schema revision must not be used, in one line; "" if it may be.
 
-    MLflow would migrate an older one at once, after which the older MLflow, of others perhaps, cannot open it any more.
+    MLflow would migrate an older database at once. The older MLflow that made it, perhaps another user's, could then no
+    longer open it.
     """
     package = importlib.util.find_spec("mlflow")
     assert package is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cluster.tracking.address import TrackingError, is_database, run_table, schema_problem, sqlite_path, sqlite_uri
 
-# MLflow's own retries would go on for minutes. `sync` tries again instead.
+# Defaults for MLflow's variables. Its own retries would go on for minutes, so there are none: `sync` tries again.
 _ENVIRONMENT = {
     "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
@@ -19,13 +19,16 @@ _ENVIRONMENT = {
 
 
 def configure_mlflow() -> None:
-    """Set MLflow's variables, before it is imported and before there are threads. What the user has set stays."""
+    """Set MLflow's environment variables, except those that the user has set.
+
+    To be called before MLflow is imported and before there are threads.
+    """
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
 
 
 def check_schema(uri: str) -> None:
-    """Raise TrackingError for a database of another version of MLflow, which would migrate it without asking."""
+    """Raise TrackingError if another version of MLflow made the database: MLflow would migrate it without asking."""
     if not is_database(uri):
         return
     from mlflow.store.db import utils
@@ -42,14 +45,14 @@ def check_schema(uri: str) -> None:
 def create_database(path: Path) -> None:
     """Make a new, complete MLflow database appear at `path`, unless another process is first.
 
-    MLflow builds it by 60 migrations in a second. If it is killed in the middle, or two runs start together, what is
-    left is a database that it can never open again. So it is built in another folder and then moved.
+    MLflow builds a database by dozens of migrations, which take a second. If it is killed meanwhile, or two runs start
+    together, it can never open that database again. So the database is built in another folder and then moved.
     """
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
     with tempfile.TemporaryDirectory(prefix=".mlflow-", dir=path.parent) as folder:
         built = Path(folder, path.name)
-        # The second argument is MLflow's default location, which breaks at some folders' names.
+        # The second argument replaces MLflow's default place for runs' files, which breaks at some folders' names.
         SqlAlchemyStore(sqlite_uri(built), (path.parent / "mlartifacts").as_uri()).engine.dispose()
         try:
             os.link(built, path)
@@ -59,7 +62,10 @@ def create_database(path: Path) -> None:
 
 
 def run_tables(uri: str, server: str) -> dict[str, str]:
-    """`run_table` of each experiment that has runs in a store, by name."""
+    """The address of each experiment's run table (`run_table`), by the experiment's name.
+
+    Args: `uri` is the store's address, `server` that of MLflow's UI. Experiments without runs are left out.
+    """
     configure_mlflow()
     from mlflow.tracking import MlflowClient
 

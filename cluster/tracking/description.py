@@ -43,7 +43,7 @@ def read_run(folder: Path) -> Content | None:
         model = None
         if summary:
             held_out, step, wall_s = held_out_metrics(summary), len(rows), float(summary["wall_s"])
-            # The last candidate is validated after the last step.
+            # The champion is chosen after the last step, so its validation is one more row.
             last = {"validation/success_rate": float(summary["validation_success_rate"])}
             rows += [(step - 1, held_out, wall_s), (step, last, wall_s)]
             path = folder / "champion.npz"
@@ -81,7 +81,7 @@ def read_rows(path: Path) -> list[tuple[int, Mapping[str, float], float]]:
 
 
 def group(settings: RunSettings) -> str:
-    """What runs that differ only in their seeds have in common, in words."""
+    """What runs that differ only in seed and limits have in common: road, learner, network and unusual settings."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [cars(settings.traffic)] if settings.traffic else []
     given = asdict(settings)
@@ -92,7 +92,7 @@ def group(settings: RunSettings) -> str:
 
 
 def tags(settings: RunSettings) -> dict[str, str]:
-    """What runs are found and grouped by, besides their parameters; `group` is all but the seed."""
+    """MLflow's tags, by which runs are found and grouped besides their parameters; the seed is in none of them."""
     return {
         "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
         "scenario": settings.scenario if len(roads_of(settings.scenario)) == 1 else label(settings.scenario),
@@ -101,7 +101,7 @@ def tags(settings: RunSettings) -> dict[str, str]:
 
 
 def held_out_metrics(summary: Mapping[str, Any]) -> dict[str, float]:
-    """Held-out figures under MLflow's names; of several roads also each one's."""
+    """The held-out figures of a summary.json by the names of MLflow's metrics; of several roads also each road's."""
     roads = {"": summary["held_out"]}
     if len(by_road := summary.get("held_out_by_road", {})) > 1:
         roads |= {f"{_plain(road)}/": figures for road, figures in by_road.items()}
@@ -114,12 +114,15 @@ def held_out_metrics(summary: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _plain(road: str) -> str:
-    """A road's label as a part of MLflow's names: other characters become "_", as MLflow takes an @ for an alias."""
+    """A road's label as a part of MLflow's names: all but letters, digits, "_", "." and "-" become "_".
+
+    MLflow would take an @ for an alias.
+    """
     return re.sub(r"[^\w.-]", "_", road)
 
 
 def model_name(settings: RunSettings) -> str:
-    """The registered model whose versions are the champions of such runs."""
+    """Name of the registered model whose versions are the champions of this algorithm on this scenario."""
     return f"gridsim-{_plain(label(settings.scenario))}-{settings.algorithm}"
 
 

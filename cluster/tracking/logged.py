@@ -1,7 +1,7 @@
-"""A folder's run in MLflow: found or created, and sent what it lacks of the folder's content. Imports MLflow.
+"""A folder's run in MLflow: it is found or created, and is sent what it lacks of the folder's content. Imports MLflow.
 
-Everything here blocks and may raise whatever MLflow raises; any call can be repeated. An object remembers only what
-MLflow was seen to have. Models are written here and never loaded.
+Calls block as long as MLflow does, and can be repeated. `LoggedRun.send` returns what MLflow raises as a text. A
+`LoggedRun` remembers only what MLflow was seen to have. Models are written here and never loaded.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
-KEY_TAG = "gridsim.key"  # by which a run is found again
+KEY_TAG = "gridsim.key"  # tag with the key (in mlflow.json) by which a folder's run is found again
 NOTE_TAG = "mlflow.note.content"  # MLflow's tag for the description
 VIEW_TAG = f"mlflow.sharedViewState.{VIEW}"  # MLflow's tag of an experiment for a saved view
 # What the view's run table shows of each run, and the columns' widths in pixels.
@@ -45,7 +45,7 @@ LINK = {"uri": str, "experiment": str, "key": str, "run_id": str, "started": flo
 
 
 class LoggedRun:
-    """The run in MLflow that belongs to a folder; `run_id` and `experiment_id` are MLflow's, "" until it is found.
+    """The run in MLflow that belongs to a folder; `run_id` and `experiment_id` are "" until it is found or created.
 
     `sent` counts the rows, files and models that were sent.
     """
@@ -60,7 +60,7 @@ class LoggedRun:
         self._registered, self._status = False, ""
 
     def lacking(self, content: Content, status: Status | None) -> list[str]:
-        """What MLflow was not seen to have, in words; `status` is None while the run goes on and its files change."""
+        """What MLflow was not seen to have, in words; only rows while the run goes on (`status` is None)."""
         rows = len({step for _, step in self._missing_rows(content)})
         words = [count(rows, "row")] if rows else []
         if status is None:
@@ -71,7 +71,10 @@ class LoggedRun:
         return words + ([f"the status {status}"] if status != self._status else [])
 
     def send(self, content: Content, status: Status | None) -> str | None:
-        """Send what MLflow lacks; what fails does not hold up the rest. Returns: the last failure, in one line."""
+        """Send what MLflow lacks: rows; with a status also files, model and end. If one part fails, the next is tried.
+
+        Returns: the last failure in one line, or None.
+        """
         error = None
         try:
             link = {} if self.run_id else self._identify(content)
@@ -92,7 +95,7 @@ class LoggedRun:
         return error
 
     def _identify(self, content: Content) -> dict[str, Any]:
-        """Write and return mlflow.json, by which a run that was killed, or had no server, is found again."""
+        """Write mlflow.json and return its content; its key finds the run again after a kill or a missing server."""
         link = read_link(self._folder)
         if link.get("uri") != redacted(self._uri):
             experiment = self._experiment or os.environ.get("MLFLOW_EXPERIMENT_NAME") or "gridsim"
@@ -103,9 +106,9 @@ class LoggedRun:
         return link
 
     def _open(self, content: Content, link: dict[str, Any]) -> None:
-        """Find the run by its key or create it, add what it lacks of parameters and tags, and ask what else it has.
+        """Find the run by its key or create it, add parameters and tags that it lacks, and ask MLflow what else it has.
 
-        It is looked for in the experiment that it was begun in, and in the one that is asked for.
+        The run is looked for in the experiment of `link`, where it was begun, and in the one that is asked for.
         """
         from mlflow.entities import Param, RunTag
         from mlflow.tracking import MlflowClient
@@ -126,7 +129,7 @@ class LoggedRun:
         tags = {"git_commit": git_commit(), **content.tags}
         new = {name: value for name, value in {NOTE_TAG: content.note, **tags}.items() if name not in data.tags}
         if not content.finished:
-            # MLflow does not let parameters change; what is different now (another commit) is added as a tag.
+            # MLflow does not let parameters change: what a resumed run changes (such as the commit) becomes a new tag.
             for wanted, have in ((content.params, data.params), (tags, data.tags)):
                 new |= {f"resumed/{name}": value for name, value in wanted.items() if have.get(name, value) != value}
             client.update_run(info.run_id, status="RUNNING")
@@ -144,7 +147,11 @@ class LoggedRun:
         self.run_id, self.experiment_id = info.run_id, info.experiment_id
 
     def _create(self, name: str, experiment_name: str, link: dict[str, Any]) -> Run:
-        """A new run, in an experiment that is made if need be, with its files beside the database and a saved view."""
+        """Create a run, and its experiment if there is none. An experiment without the saved view gets it.
+
+        In a database, a new experiment keeps its runs' files in `mlartifacts`, beside a SQLite file or else in the
+        working directory.
+        """
         from mlflow.exceptions import MlflowException
         from mlflow.tracking.context.git_context import GitRunContext
         from mlflow.tracking.context.registry import resolve_tags
@@ -162,7 +169,7 @@ class LoggedRun:
         if VIEW_TAG not in experiment.tags:  # one that is there may be the user's own, changed in the UI
             with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
                 client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, _view())
-        # mlflow.user, mlflow.source.*, and the parent of a comparison's run (MLFLOW_RUN_CONTEXT)
+        # MLflow's own tags: mlflow.user, mlflow.source.*, and the parent of a comparison's run (MLFLOW_RUN_CONTEXT).
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]
         tags = {**natural, KEY_TAG: link["key"]}
         return client.create_run(experiment.experiment_id, int(1000.0 * link["started"]), tags, name)
@@ -177,7 +184,7 @@ class LoggedRun:
         }
 
     def _send_rows(self, content: Content, status: Status | None) -> None:
-        """Send missing rows. Their times follow from the start, so MLflow recognises a request that is sent again."""
+        """Send missing rows. A row's time is the run's start + wall_s: MLflow recognises a row that is sent again."""
         from mlflow.entities import Metric
 
         metrics = [
@@ -198,17 +205,17 @@ class LoggedRun:
                 self.sent["file"] += 1
 
     def _upload(self, path: Path, folder: str | None = None) -> None:
-        """Store one file. MLflow's own pool of threads for several would hold up the exit if a server hangs.
+        """Store one file as an artifact. For several, MLflow uses threads, which delay the exit if a server hangs.
 
-        Raises TrackingError, which names the folder, if files are kept in one that is missing or cannot be written.
+        Raises TrackingError, which names the folder, if artifacts are kept in one that is missing or cannot be written.
         """
         from mlflow.utils.file_utils import local_file_uri_to_path
         from mlflow.utils.uri import is_local_uri
 
         served = self._uri.startswith("http")
         if (served or is_database(self._uri)) and is_local_uri(self._location):
-            place = Path(local_file_uri_to_path(self._location)).parents[1]  # without the run's id and `artifacts`
-            if not (place.is_dir() or place.parent.is_dir()):  # MLflow would make it, on the wrong machine
+            place = Path(local_file_uri_to_path(self._location)).parents[1]  # the experiment's folder
+            if not (place.is_dir() or place.parent.is_dir()):  # MLflow would make both, on the wrong machine
                 remedy = "start the server with --serve-artifacts and " if served else ""
                 raise TrackingError(
                     f"the experiment keeps its files in {place}, which is not on this machine: create it if they "
@@ -246,7 +253,10 @@ class LoggedRun:
         self._registered = True
 
     def _register(self, model: Model) -> None:
-        """Make the stored model the newest version of its name, unless it is one already; the best one becomes BEST."""
+        """Register the stored model as a new version, unless this run has registered this champion already.
+
+        The best version gets the alias BEST.
+        """
         from mlflow.exceptions import MlflowException
 
         client, source = self._client, f"{self._location.rstrip('/')}/{MODEL}"
@@ -266,7 +276,7 @@ class LoggedRun:
     def _end(self, content: Content, status: Status | None) -> None:
         """Add the result to the description, which a user may have edited, and end the run `wall_s` after its start.
 
-        MLflow's UI shows this time as the run's duration, and knows no pauses.
+        MLflow's UI shows the time from start to end as the duration, so a training run's `wall_s` leaves out pauses.
         """
         if status == self._status:
             return

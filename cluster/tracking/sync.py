@@ -27,16 +27,18 @@ from cluster.tracking.logged import LoggedRun, Status
 
 SYNC_S = 2.0  # rows that come within this time are one request: a row takes 5 ms of CPU alone, 0.8 ms among many
 RETRY_S = 5.0  # after a sync that failed
-LAST_RETRY_S = 1.0  # between the last syncs
+LAST_RETRY_S = 1.0  # between syncs after the run has ended
 
 
 def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
-    """Sync a folder until a status comes, then once or twice; a locked database is tried until we are killed.
+    """Sync a folder until a status comes, then once more, or twice if that fails.
+
+    While the database is locked by others, this goes on until the process is killed.
 
     Args:
         orders: a line of JSON with `folder`, `uri`, `experiment`, `argv`, and `read`, the function that reads the
             folder, as "module:name"; later perhaps one with a status.
-        answers: gets what is known of MLflow's run, and what it lacks, before and after a request.
+        answers: gets lines of JSON: the ids of MLflow's run, what was sent, the last error, and what MLflow lacks.
         at_eof: is called in a thread when `orders` ends, as it does when the run's process has ended.
     """
     order, ends = json.loads(orders.readline()), SimpleQueue[Status]()
@@ -58,7 +60,7 @@ def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
         import mlflow.store.tracking.sqlalchemy_store  # noqa: F401
     from mlflow.utils.requirements_utils import warn_dependency_requirement_mismatches
 
-    # For a model, MLflow lists the installed packages once, in 0.3 s. Here that is done while the run goes on.
+    # Before MLflow saves its first model, it lists the installed packages, for 0.3 s. Do it now, while the run goes on.
     warn_dependency_requirement_mismatches(["mlflow"])
     folder, read = Path(order["folder"]), pkgutil.resolve_name(order["read"])
     run = LoggedRun(folder, order["uri"], order["experiment"])

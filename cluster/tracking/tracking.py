@@ -1,8 +1,8 @@
 """Keeps MLflow up to date with a folder: what the folder has and MLflow lacks is sent until MLflow has all of it.
 
-The folder is the queue. So MLflow may be away for as long as it likes, and never stops or slows a run: a process of its
-own (`sync.py`) sends every few seconds and a last time at the end, and what could not be sent then is sent by a later
-`sync` of the folder. The 3 s that MLflow's import takes do not delay the run.
+The folder is the queue. So MLflow may be away for any time, and never stops a run or slows its learning: a separate
+process (`sync.py`) sends every few seconds and a last time at the end, and what could not be sent then is sent by a
+later `sync` of the folder. The 3 s that MLflow's import takes do not delay the run.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from cluster.tracking.address import UI, TrackingError, check_uri, is_database, 
 from cluster.tracking.content import Content
 from cluster.tracking.logged import Status, read_link
 
-CLOSE_S, STOP_S = 60.0, 15.0  # s that closing takes at most, for a finished run and for one that was stopped
+CLOSE_S, STOP_S = 60.0, 15.0  # s that closing takes at most: for a finished run, and for one that stopped or failed
 
 Read = Callable[[Path], Content | None]
 """Reads what MLflow is to have of a folder, None if that is nothing yet; a function of a module."""
 
 
 class Tracking:
-    """A process that keeps MLflow up to date with a folder, from `start` to `close`; `listen` is called in between.
+    """A process that keeps MLflow up to date with a folder, from `start` to `close`.
 
-    `run_id` is MLflow's id of the run, "" until it is known; `sent` counts the rows, files and models that were sent;
-    `error` says why the last sync failed, in one line, and is None when MLflow has all.
+    `listen` is called after `start`, or else by `close`. `run_id` is MLflow's id of the run, "" until it is known;
+    `sent` counts the rows, files and models that were sent; `error` says in one line why the last sync failed, and is
+    None if it did not.
     """
 
     def __init__(self, folder: Path, uri: str, experiment: str, read: Read):
@@ -59,12 +60,15 @@ class Tracking:
         self._listener = threading.Thread(target=self._listen, args=(self._process,), daemon=True)
 
     def listen(self) -> None:
-        """Start the thread that takes in what the process tells."""
+        """Start the thread that reads the process's answers."""
         if self._process:
             self._listener.start()
 
     def wait_id(self, timeout_s: float) -> str:
-        """Wait for MLflow's id of the run; "" if there is none by then, or as soon as a sync has failed."""
+        """Wait for MLflow's id of the run; "" if there is none in time, or once a sync fails. Raises Stopped.
+
+        A sync that failed because the database was locked does not count.
+        """
         end = time.monotonic() + timeout_s
         while self._process and not self.run_id and time.monotonic() < end:
             if self.error is not None and not is_locked(self.error):
@@ -96,14 +100,17 @@ class Tracking:
         return None if nothing or not lacking else f"not logged to MLflow at {redacted(self.uri)}: {lacking}: {reason}"
 
     def where(self, mlflow: str) -> str:
-        """How to see the run beside others in MLflow's UI, in words for the terminal; `mlflow` is how to call it."""
+        """How to see the run beside others in MLflow's UI, in words for the terminal.
+
+        Args: `mlflow` is the command `mlflow` as the user would type it.
+        """
         served, shown = self.uri.startswith("http"), redacted(self.uri)
         if not (served or is_database(self.uri)):
             return shown
         table = run_table(self.uri if served else UI, self._experiment_id) if self._experiment_id else ""
         if served:
             return table or shown
-        make = "make ui, or " if sqlite_path(self.uri) == Path.cwd() / "mlflow.db" else ""  # the store that it shows
+        make = "make ui, or " if sqlite_path(self.uri) == Path.cwd() / "mlflow.db" else ""  # what `make ui` shows
         command = f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {shlex.quote(shown)}"
         without = "" if shown == self.uri else " (add its user and password, which are not shown)"
         return f"{command}{without}" + (f"; then open\n{table}" if table else "")
@@ -115,7 +122,7 @@ class Tracking:
             print(json.dumps(message), file=self._process.stdin, flush=True)
 
     def _listen(self, process: Popen[str]) -> None:
-        """Take in what the process tells until it ends."""
+        """Read the process's answers until it ends."""
         assert process.stdin
         assert process.stdout
         with process.stdout as answers:
@@ -131,9 +138,10 @@ class Tracking:
 
 
 def sync(folder: Path, uri: str, experiment: str, read: Read, status: Status = "FINISHED") -> tuple[str, str | None]:
-    """Send what MLflow lacks of a folder that no run is using; if `uri` is "", to where it was last sent.
+    """Send what MLflow lacks of a folder that no run is using.
 
-    Returns: what was sent, in words, and None or one line about what could not be.
+    Args: `uri` is where to; "" is the address that the folder was last sent to, or else that of `check_uri`.
+    Returns: what was sent, in words, and None or one line about what could not be sent.
     """
     try:
         tracking = Tracking(folder, check_uri(uri, saved_uri(folder)), experiment, read)

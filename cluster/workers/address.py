@@ -9,15 +9,15 @@ import warnings
 from cluster.redaction import redacted
 from cluster.workers.pool import PoolError
 
-CONNECT_S = 3.0  # at most, until something answers at an address
+CONNECT_S = 3.0  # longest wait until something answers at an address
 
 
 def cluster_address(given: str) -> str | None:
     """The Ray cluster to join, `host:port` or `auto`; None: this machine alone.
 
-    It is `given` (--address), or RAY_ADDRESS if that is set and `given` is "" or `auto`. Ray's guide sets RAY_ADDRESS
-    to http://..., where Ray takes jobs: no cluster to join, so it is ignored with a warning. Raises PoolError as
-    `check_address`.
+    It is `given` (--address), or RAY_ADDRESS if that is set and `given` is "" or `auto`; `local` means this machine.
+    Ray's guide sets RAY_ADDRESS to http://..., where Ray takes jobs. That is no cluster to join: if `given` is "", it
+    is ignored with a warning. Raises PoolError as `check_address`.
     """
     usual = os.environ.get("RAY_ADDRESS", "")
     if usual == "" or given not in ("", "auto"):

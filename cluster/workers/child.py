@@ -13,7 +13,8 @@ from pathlib import Path
 # its own that do not end.
 GRACE_S = 60
 # This shell starts a second one and then becomes the command. The second shell reads from a pipe that only our process
-# holds open. When the pipe ends, because we close it or are killed, it ends the command and all in its session.
+# holds open. When the pipe ends, because we close it or are killed, the second shell ends the command, and then kills
+# all that is left in the command's session.
 _SHELL = """exec 3<&0; grace_s=$1; shift
 (read _ <&3; kill -TERM $$
 for _ in $(seq $grace_s); do sleep 1; kill -0 $$ || break; done
@@ -22,7 +23,7 @@ exec "$@" 3<&- </dev/null"""
 
 
 class Child:
-    """A command in a session of its own, so that Ctrl-C does not reach it. What it prints goes to a file, `log`."""
+    """A command in a session of its own, so that Ctrl-C does not reach it. Its output goes to `log`, if given."""
 
     def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None, log: Path | None = None):
         with open(log or os.devnull, "wb") as output:
@@ -45,12 +46,15 @@ class Child:
         return self.exit_code() is None
 
     def terminate(self) -> None:
-        """End the pipe: the shell sends SIGTERM to the command and, after GRACE_S, SIGKILL to its whole session."""
+        """End the pipe: the shell sends SIGTERM to the command, and within GRACE_S SIGKILL to its whole session."""
         assert self._process.stdin
         self._process.stdin.close()
 
     def close(self, patience_s: float | None) -> None:
-        """End the command; after `patience_s` (None: never) kill what is left in its session. May be called again."""
+        """End the command, wait for it (at most `patience_s`; None: any time), and kill the rest of its session.
+
+        May be called again.
+        """
         self.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)

@@ -21,7 +21,8 @@ def cores(root: Path = Path("/")) -> int:
             folder, files = root / "sys/fs/cgroup", ["cpu.max"]
             if controllers:  # version 1 of control groups
                 folder, files = folder / "cpu", ["cpu.cfs_quota_us", "cpu.cfs_period_us"]
-            # Quotas of the groups above count, too. In a container the path may be the host's, whose groups it lacks.
+            # Quotas of the groups above count, too. In a container the path may be the host's, whose groups do not
+            # exist in the container.
             for name in (".", *path.split("/")):
                 folder /= name
                 with contextlib.suppress(OSError, ValueError):  # no such group; "max", no quota

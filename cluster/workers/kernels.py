@@ -1,9 +1,9 @@
 """Compiling the kernels that a run needs, before it needs them: once for all processes, and on more than one core.
 
 Numba compiles one function at a time in a process. So separate processes compile what is missing in the cache on disk
-(`gridsim.jit`), from which all others then load it: `python -m cluster.workers.kernels PART SCENARIO SIM POLICY
-TRAFFIC COMMAND`, with a part of `PARTS`. `python -m cluster.workers.kernels everything` compiles what the learners need
-by default on all roads, for an image that is to be started often.
+(`gridsim.jit`), from which all other processes then load it. Their command is `python -m cluster.workers.kernels PART
+SCENARIO SIM POLICY TRAFFIC COMMAND`, where PART is one of `PARTS`. `python -m cluster.workers.kernels everything`
+compiles what the learners need by default on all roads, for a container image that is to be started often.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from gridsim.simulator import views
 from gridsim.state import CAR_FIELDS
 from gridsim.traffic.world import spawn
 
-OWN = "fitness"  # in names of markers and on command lines: the run has a fitness of the user's own
+OWN = "fitness"  # says in a marker's name and on a command line that the run has a fitness of the user's own
 PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
 
 
 def _marker(settings: RunSettings) -> Path:
-    """The file whose existence says that all kernels are compiled which such a run needs."""
+    """The file whose existence says that all kernels that such a run needs are compiled."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else file_name(label(settings.scenario))
     traffic = "traffic" if settings.traffic else "alone"
@@ -68,7 +68,7 @@ def is_compiled(settings: RunSettings) -> bool:
 
 
 def compile_ahead(settings: RunSettings) -> None:
-    """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
+    """Compile the kernels that a run needs, in other processes. If that fails, they are compiled on first use."""
     what = [settings.scenario, settings.sim, settings.policy, str(max(settings.crowds)), settings.command]
     what += [OWN] if has_own(settings) else []
     compilers = list[Child]()
@@ -87,7 +87,10 @@ def compile_ahead(settings: RunSettings) -> None:
 
 
 def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, command: str, own: str = "") -> None:
-    """Compile one of PARTS in this process, or load it from the cache, by the smallest drive: one step, on no road."""
+    """Compile one of PARTS in this process, or load it from the cache, by using it.
+
+    The drives have one step, on a map without a road; `roads` also builds a map of each road of the scenario.
+    """
     config, spec, road = SimConfig.load(sim), PolicySpec.parse(policy), blank()
     genome, keys = np.zeros(spec.size, dtype=np.float32), np.zeros(1, dtype=np.uint64)
     episodes = np.zeros(1, dtype=EPISODE)

@@ -7,12 +7,12 @@ from cluster.workers.threads import ThreadPool
 
 
 def open_pool(workers: int, address: str | None, patience_s: float, build_map: BuildMap) -> WorkerPool:
-    """Open a pool; returns when it can work. To be called before threads are started: it sets Ray's variables.
+    """Open a pool, and return once it can work. Call this before any thread is started: it sets environment variables.
 
     Args:
         workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
         address: an existing Ray cluster (`host:port` or `auto`), on which 0 workers mean one for each free CPU; None: a
-            Ray of our own.
+            Ray of our own, which is started on this machine.
         patience_s: how long to go on without any Ray worker, and to wait for a silent one; 0: 300 s, but 60 s for a
             silent one in a Ray of our own.
 

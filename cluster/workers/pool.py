@@ -19,7 +19,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.state import START_FIELDS
 
-BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; each call asks again, so it keeps its maps
+BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; pools ask for a map repeatedly, so it keeps its maps
 
 LOOK_S = 0.1  # between two looks at whether the run is to be stopped
 
@@ -44,7 +44,7 @@ class Call(ABC):
     """What a pool is asked to do, and, as it comes in, the result."""
 
     noun: ClassVar[str]
-    axis: ClassVar[int]  # of a chunk, along which the noun is counted: 0 rows, 1 columns
+    axis: ClassVar[int]  # the axis of a chunk that `noun` counts: 0 rows, 1 columns
 
     def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk] | None, rows: int):
         columns = len(task.episodes)
@@ -52,11 +52,14 @@ class Call(ABC):
         self.asked = [Chunk(slice(0, rows), slice(0, columns))] if asked is None else asked
         self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for
         self.warnings: list[str] = []  # a line for each worker that was replaced
-        self.total, self.done = sum(map(size, self.asked)), 0  # episodes to be driven, and those that are
+        self.total, self.done = sum(map(size, self.asked)), 0  # numbers of episodes: to be driven, and driven
         self.busy_s: dict[int, float] = defaultdict(float)  # seconds of work by each worker, for statistics only
 
     def progress(self) -> tuple[int, int]:
-        """Members (or episodes of experience) that are done, partly evaluated ones in part, and how many there are."""
+        """How many members (or episodes of experience) are done, and how many there are.
+
+        The first number is estimated from the share of episodes that are driven.
+        """
         n = self.results.shape[self.axis]
         return (n * self.done // self.total if self.total else 0), n
 
@@ -79,11 +82,11 @@ class Call(ABC):
 
 
 class Outcome(Call):
-    """A generation: rows are members, in the order of the recipes, columns the task's episodes.
+    """The evaluation of members. Rows are members, in the order of the recipes; columns are the task's episodes.
 
     Args:
         recipes: RECIPE [n], of the members that are bred and driven.
-        asked: which members drive which episodes, the longest first; None is all members on all episodes.
+        asked: which members drive which episodes, chunks of long episodes first; None: all drive all.
     """
 
     noun, axis = "members", 0
@@ -91,12 +94,13 @@ class Outcome(Call):
 
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
         super().__init__(task, recipes, asked, len(recipes))
-        # The state `rewind` steps before each episode's end, and the traffic then, [episodes, cars, TRAFFIC_FIELDS].
+        # Of episodes with `rewind`: the state so many steps before the end, [episodes, START_FIELDS], and the traffic
+        # then, [episodes, cars, TRAFFIC_FIELDS]. Zero for other episodes.
         self.rewound, self.worlds = np.zeros((len(task.episodes), START_FIELDS), np.float32), np.zeros_like(task.worlds)
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         results, rewound, worlds, seconds = answer
-        if rewound.size:  # only one member drives such an episode
+        if rewound.size:  # the piece's episodes have `rewind`; only one member (the leader) drives such episodes
             self.rewound[piece.columns], self.worlds[piece.columns] = rewound[0], worlds[0]
         self._count(worker, piece, results, seconds)
 
@@ -110,7 +114,7 @@ class Outcome(Call):
 
 
 class Collected(Call):
-    """A batch of experience: the task's policy drives its episodes, the columns."""
+    """A batch of experience. The task's network, the only row, drives the task's episodes, the columns."""
 
     noun, axis = "episodes", 1
     task: CollectTask
@@ -140,14 +144,14 @@ AnyCall = TypeVar("AnyCall", bound=Call)
 class WorkerPool(ABC):
     """Evaluates generations and collects experience, one call at a time.
 
-    A call is started and waited for. Its owner may do other work between two waits, but some tens of milliseconds at a
-    time: Ray workers hold two pieces of work, and get more only in `wait`. What a call returns depends on its arguments
-    alone, never on the workers. A call that is started while another one is under way takes its place.
-    Raises: PoolError if what is asked for cannot be done; the pool can be used again.
+    `start` begins a call, and `wait` is then called until the call is done. Between two waits the caller may do other
+    work, but only for some tens of milliseconds: a Ray worker holds two pieces, and gets more only in `wait`. A call's
+    results depend on its arguments alone, never on the workers. A call that is started while another one is under way
+    replaces that one. Raises: PoolError if a call cannot be done; the pool can still be used for others.
     """
 
-    workers: int  # how many Ray workers were asked for; 0 for threads of this process
-    _call: Call | None = None  # the latest one, unless it failed; others are left undone
+    workers: int  # number of Ray workers; 0 if the workers are threads of this process
+    _call: Call | None = None  # the latest call, unless it failed; the pool does not finish earlier ones
 
     def start(self, call: AnyCall) -> AnyCall:
         """Begin a call, and return it at once."""
@@ -189,13 +193,14 @@ class WorkerPool(ABC):
 
 
 def cut(call: Call, workers: int, least_m: float, most_m: float) -> list[Chunk]:
-    """Cut what is asked for into pieces, by the metres that it may take: large ones first, small ones last.
+    """Cut a call's chunks into pieces, by the metres that these may take to drive: large ones first, small ones last.
 
-    Each takes half of a worker's share of the rest, so that no worker waits long for the slowest (guided
-    self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or some episodes of one, so that even a
-    single member is shared by all workers. No result depends on the cut.
+    Each piece has half of one worker's share of the metres that are left, so that no worker waits long for the slowest
+    (guided self-scheduling, Polychronopoulos and Kuck 1987). A piece holds one or more members with all episodes of
+    their chunk, or one member with some of them: so all workers can share even a single member. No result depends on
+    the cut.
 
-    Args: the least and the most metres of a piece. A metre takes a small network some microseconds at most.
+    Args: `least_m` and `most_m`, metres in a piece. A metre takes a small network some microseconds at most.
     """
     episodes = call.task.episodes
     goals = np.maximum(np.minimum(episodes["target"], episodes["steps"]), 1).astype(np.float64)  # a step counts as 1 m
@@ -222,6 +227,6 @@ def cut(call: Call, workers: int, least_m: float, most_m: float) -> list[Chunk]:
 
 
 def last_line(error: BaseException) -> str:
-    """An exception as one line of text, its type first, whatever its message looks like."""
+    """An exception as one line of text: its type, and the last line of its message that is not empty."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__

@@ -1,7 +1,8 @@
 """A pool of Ray actors, on a Ray of our own or on an existing cluster.
 
-Dead actors are replaced here, not by Ray's `max_restarts`, since what they held is sent again either way. Actors that
-do not answer for long are replaced, too: Ray may never report one that is stopped or cut off.
+Dead actors are replaced here, not by Ray's `max_restarts`, since the pieces that they held have to be sent again either
+way. Actors that do not answer for long are replaced, too: Ray may never report that an actor's process is suspended, or
+that its machine cannot be reached.
 """
 
 from __future__ import annotations
@@ -25,19 +26,24 @@ from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a silent worker of a Ray of our own; of a cluster, or without a worker
-MAX_KILLS = 3  # deaths of workers over one piece at which the call fails
+# Defaults of --patience. A silent worker is replaced after PATIENCE_S in a Ray of our own, after LONG_PATIENCE_S on a
+# cluster. The pool goes on without any worker for LONG_PATIENCE_S at most.
+PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0
+MAX_KILLS = 3  # a call fails when so many workers have died over the same piece
 MAX_DEATHS = 8  # workers that may die in a row without an answer in between, or 3 times their number if that is more
-QUEUED = 2  # pieces that a worker is sent, so that it need not wait for the next one
-LEAST_M, MOST_M = 5_000.0, 40_000.0  # metres in a piece; at 1 ms each, the largest networks need less than PATIENCE_S
-MANY_M = 400.0  # metres per worker in a smallest piece: it takes as long as sending all other workers theirs
+QUEUED = 2  # pieces that a worker holds at once, so that it need not wait for the next one
+# Least and most metres in a piece. The largest networks need 1 ms for a metre, so less than PATIENCE_S for a piece.
+LEAST_M, MOST_M = 5_000.0, 40_000.0
+# Least metres in a piece for each worker of the pool: a piece then takes as long as sending one to every other worker.
+MANY_M = 400.0
 
 
 class Actor:
     """A worker's process. It keeps the current task, and the run's maps, of which there are some hundreds at most."""
 
     def __init__(self, factory: Callable[[], Worker]):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all; the coordinator ends its workers
+        # A terminal sends Ctrl-C to all its processes. Workers ignore it, as the process with the pool ends them.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._worker, self._shared = factory(), list[Any]()
         self._task: AnyTask
         self._maps: dict[tuple[str, int], Map] = {}  # by scenario and seed
@@ -47,7 +53,10 @@ class Actor:
         return os.getpid()
 
     def run(self, shared: list[Any], recipes: bytes, columns: slice) -> bytes:
-        """What `Worker.answer` returns for a piece of the task that `shared` names, in bytes (faster than arrays)."""
+        """Do a piece of the task that `shared` refers to.
+
+        Returns: what `Worker.answer` returns, pickled, because Ray sends bytes faster than arrays.
+        """
         if shared != self._shared:
             import ray
 
@@ -69,15 +78,16 @@ class _Piece:
 @dataclass(eq=False)
 class _Worker:
     actor: Any
-    sent: deque[tuple[Any, _Piece | None]]  # references to its answers, oldest first; the first one says that it is up
-    pid: int = 0  # once it is up
+    # For each answer to come, oldest first: a reference to it, and its piece (None for the answer of `Actor.ready`).
+    sent: deque[tuple[Any, _Piece | None]]
+    pid: int = 0  # of its process; 0 until it is up
     heard: float = field(default_factory=time.monotonic)  # last sign of life: an answer, or work sent to it while idle
 
 
 class RayPool(WorkerPool):
-    """Workers as Ray actors of one CPU each. One Ray at a time in a process.
+    """Workers as Ray actors of one CPU each. A process can use only one Ray at a time.
 
-    Args: those of `open_pool`, and `worker_factory`, which makes what evaluates; it must be importable in the workers.
+    Args: those of `open_pool`; `worker_factory` makes an actor's `Worker`, and must be importable there.
     """
 
     def __init__(
@@ -88,9 +98,9 @@ class RayPool(WorkerPool):
         self._patience_s = patience_s or LONG_PATIENCE_S
         self._silence_s = patience_s or (PATIENCE_S if address is None else LONG_PATIENCE_S)
         self._session = Session()
-        self._ray: Any = None  # once it is joined
+        self._ray: Any = None  # the module `ray`, once Ray is joined
         self._workers: list[_Worker] = []  # one that dies is replaced
-        self._shared = list[Any]()  # a reference to the latest task and to its maps' references
+        self._shared = list[Any]()  # one Ray reference, to (the latest task, references to its maps by name)
         self._maps: dict[tuple[str, int], Any] = {}  # references to maps in Ray's store
         self._pieces: deque[_Piece] = deque()  # to be sent
         self._deaths = 0  # of workers since the latest answer
@@ -151,7 +161,7 @@ class RayPool(WorkerPool):
                 worker.sent.append((worker.actor.run.remote(self._shared, recipes, piece.chunk.columns), piece))
 
     def _receive(self, worker: _Worker) -> None:
-        """Take in a worker's oldest answer, or its death."""
+        """Take in the oldest outstanding answer of a worker, or that the worker is dead."""
         (reference, piece), errors = worker.sent[0], self._ray.exceptions
         try:
             answer = self._ray.get(reference)
@@ -169,8 +179,8 @@ class RayPool(WorkerPool):
             piece.call.add(worker.pid, piece.chunk, *pickle.loads(answer))
 
     def _replace(self, worker: _Worker, why: str) -> None:
-        """Replace a worker, and have what it held done by another one."""
-        at_it = worker.sent[0][1]  # the piece that it was at; the others it had not begun
+        """Replace a worker, and put the pieces that it held back into the queue."""
+        at_it = worker.sent[0][1]  # the piece that the worker was at; it had not begun any other piece that it held
         self._pieces.extendleft(piece for _, piece in reversed(worker.sent) if piece and piece.call is self._call)
         self._ray.kill(worker.actor)  # a worker that is out of reach may still be alive
         self._workers[self._workers.index(worker)] = self._begin()

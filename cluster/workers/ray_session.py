@@ -1,4 +1,4 @@
-"""Ray itself, by its public names: one of our own on this machine, or a cluster that is joined; what its errors say."""
+"""Starts a Ray of our own on this machine, or joins a cluster, by Ray's public API alone; explains Ray's errors."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ from cluster.workers.child import Child
 from cluster.workers.pool import LOOK_S, PoolError, last_line
 from gridsim.jit import CACHE_FOLDER
 
-PACKAGES = ("cluster", "evolution", "gridsim")  # that are sent to a cluster's workers
+PACKAGES = ("cluster", "evolution", "gridsim")  # our packages, which are sent to the workers
 ENVIRONMENT = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
-    "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job may have been submitted with files of its own
-    "RAY_CLIENT_MODE": "0",  # Ray sets this and the next one if they are missing, when there may be threads
+    "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # in a Ray job that has files of its own, ours override them (else: an error)
+    # Ray itself sets the next two variables, when there may be threads. Adding a variable beside threads is unsafe, so
+    # they are added before.
+    "RAY_CLIENT_MODE": "0",
     "PYTHONBREAKPOINT": "ray.util.rpdb._driver_set_trace",
-    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # prints nothing, deaths of workers included
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",  # matches every line: Ray prints none about workers here, not even that one died
 }
-CLUSTER_ENVIRONMENT = {  # added where an address is given: what answers there may not be Ray
+CLUSTER_ENVIRONMENT = {  # added where an address is given, to fail soon if what answers at it is not Ray
     "RAY_py_gcs_connect_timeout_s": "3",  # for each of three requests
     "RAY_gcs_server_port_wait_time_s": "1",
 }
 OWN_ENVIRONMENT = {  # added for a Ray of our own, which admits only who has its token
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # listens on loopback alone, as Ray does by itself on Windows and macOS
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # Ray listens on loopback alone, its default on Windows and macOS
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
 HEAD_ENVIRONMENT = {  # for the processes of a Ray of our own, not for this one
-    "RAY_prestart_worker_first_driver": "0",  # workers that are started early lack our environment
-    "RAY_worker_niceness": "0",  # Ray's 15 would let a busy machine starve the workers until patience ends the run
-    "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1]),  # a relative name would mean another folder there
+    "RAY_prestart_worker_first_driver": "0",  # Ray starts no workers early, which would lack our environment
+    "RAY_worker_niceness": "0",  # with Ray's 15, other programs could starve the workers, until --patience ends the run
+    "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1]),  # absolute: Ray's processes have another working folder
 }
 MEANINGS = {  # what Ray's errors mean, by what their long texts contain
     "OutOfMemoryError": "memory is full where it ran; close other programs there, or give fewer --workers",
@@ -54,8 +56,10 @@ MEANINGS = {  # what Ray's errors mean, by what their long texts contain
     "Could not find any running": "none runs on this machine; start one with `ray start --head`, or give its host:port",
     "Version mismatch": "it has another version of Ray or Python",
 }
-STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
-ENDING_S = 10.0  # that Ray's processes get to end by themselves
+# Size of Ray's object store, in shared memory, which is taken page by page as it is used. On a machine with less shared
+# memory, Ray uses files in its folder.
+STORE_BYTES = 768 << 20
+ENDING_S = 10.0  # time that Ray's processes get to end by themselves
 _has_token = False  # whether OWN_ENVIRONMENT was set when Ray was imported, which is when Ray reads it
 
 
@@ -78,7 +82,8 @@ class Session:
         _has_token = _has_token or address is None
         wanted = ENVIRONMENT | (OWN_ENVIRONMENT if address is None else CLUSTER_ENVIRONMENT)
         new = wanted.keys() - os.environ.keys()
-        os.environ.update({name: wanted[name] for name in new})  # threads that start later may read it at any time
+        # Set now, since threads that start later may read the environment at any time.
+        os.environ.update({name: wanted[name] for name in new})
         try:
             return self._join(address or self._start(cpus, patience_s))
         finally:
@@ -115,12 +120,13 @@ class Session:
         return address
 
     def _join(self, address: str) -> Any:
-        """Connect to the Ray at an address, whose workers are sent our packages, and so run these sources."""
+        """Connect to the Ray at an address. Its workers are sent our packages, so that they run the same sources."""
         import ray
 
         terminal, self._joined = os.dup(2), True
-        # In a thread Ray leaves the handlers of signals alone. Without a `working_dir` it puts this process's working
-        # folder first on its workers' path, where a user's `evolution.py` would be found in place of our package.
+        # If it is initialised in a thread, Ray leaves the handlers of signals alone. Without a `working_dir`, Ray puts
+        # this process's working folder first on `sys.path` of the workers, where a user's `evolution.py` would hide our
+        # package.
         with tempfile.TemporaryDirectory() as empty, open(os.devnull, "w") as nowhere, ThreadPoolExecutor(1) as thread:
             modules = [str(Path(__file__).parents[2] / package) for package in PACKAGES]
             sent = {"py_modules": modules, "excludes": ["__pycache__"], "working_dir": empty}
@@ -142,9 +148,9 @@ class Session:
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 
     def close(self) -> None:
-        """Leave Ray; end one of our own, and remove its folder. May be called again."""
+        """Leave Ray; if it is our own, end it and remove its folder. May be called again."""
         if self._joined:
-            gc.disable()  # a reference to Ray that another thread's collection frees while Ray stops ends this process
+            gc.disable()  # this process would crash if a thread's collection freed a Ray reference while Ray stops
             sys.modules["ray"].shutdown()
             gc.enable()
         if self._head:

@@ -25,7 +25,7 @@ class ThreadPool(WorkerPool):
 
     Args:
         threads: how many; 0 is one for each core.
-        worker_factory: makes what evaluates, which all threads share.
+        worker_factory: makes the one `Worker` that all threads share.
     """
 
     workers = 0

@@ -24,14 +24,14 @@ class _Common:
 
     policy: str  # as in `mlp:6,7`
     episodes: np.ndarray  # EPISODE [episodes]
-    worlds: np.ndarray  # the traffic that each begins with, float32 [episodes, cars, TRAFFIC_FIELDS]
+    worlds: np.ndarray  # the traffic at the start of each episode, float32 [episodes, cars, TRAFFIC_FIELDS]
     maps: tuple[tuple[str, int], ...]  # (scenario, seed) of each map that `episodes` indexes
     config: SimConfig
 
 
 @dataclass(frozen=True)
 class Task(_Common):
-    """A generation. A call says which members (recipes) drive which episodes."""
+    """Members to be bred and driven. The call (`Outcome`) has their recipes, and says which drive which episodes."""
 
     parents: np.ndarray  # genomes float32 [parents, genes] that the recipes name
     key: int  # seed of the generation's random numbers, 64 bits
@@ -45,7 +45,7 @@ class CollectTask(_Common):
 
     weights: np.ndarray  # float32 [genes]
     epsilons: np.ndarray  # float32 [episodes], the share of random actions in each
-    keys: np.ndarray  # uint64 [episodes], of the random numbers of each
+    keys: np.ndarray  # uint64 [episodes], the seed of each episode's random numbers
 
 
 AnyTask = Task | CollectTask
@@ -61,7 +61,7 @@ class Worker:
     def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, columns: slice) -> tuple[Any, ...]:
         """Do a chunk: recipes RECIPE [n] (not used by a `CollectTask`), on the episodes `columns` of the task.
 
-        Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
+        Returns: what `evaluate` or `collect` returns, then the seconds that it took (for statistics only).
         """
         started = time.perf_counter()
         task = replace(task, episodes=task.episodes[columns], worlds=task.worlds[columns])
@@ -73,12 +73,12 @@ class Worker:
         return *found, time.perf_counter() - started
 
     def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-        """What `rollout.evaluate` returns for recipes RECIPE [n]."""
+        """Breed members from recipes RECIPE [n], and drive them. Returns: as `rollout.evaluate`."""
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, space(spec), task.mutation)
         return evaluate(spec, genomes, maps, task.episodes, task.config, task.worlds, task.comfort)
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
-        """What `rollout.collect` returns."""
+        """Drive the task's network and record its experience. Returns: as `rollout.collect`."""
         spec = PolicySpec.parse(task.policy)
         return collect(spec, task.weights, maps, task.episodes, task.epsilons, task.keys, task.config, task.worlds)

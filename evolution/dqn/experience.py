@@ -1,16 +1,17 @@
 """Experience of the DQN as arrays, and the compact format of observations.
 
-Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, its
-action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.state.End` of the episode. Row T has the
-observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. After an end that truncates, the value is
-estimated from row T.
+Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, and the
+step's action and reward; `ends` is 0 except in row T - 1, where it is the `gridsim.state.End` of the episode. Row T has
+the observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. After an end that truncates, the value
+of what follows is estimated from row T.
 
 Observations are the network's inputs in a format small enough to keep a million of them:
 
-* rays: int16 [inputs], what `policy.normalise` makes, in units of 1/4096 and clipped to [-8, 8);
+* rays: int16 [inputs], what `observation.normalise` writes, in units of 1/4096 and clipped to [-8, 8);
 * grid: uint8 [1602], one frame, then the speed input as little-endian int16 in the same units. A cell takes two bits:
   0, 1 and 2 for unknown, free and occupied. Cell k is in byte k // 4, in bit 2 (k mod 4) and the bit above it. The
-  earlier frames of a stack are in the rows before; before the episode's first row they are copies of its frame.
+  earlier frames of a stack are those of the rows before; frames before the episode's first row are copies of that row's
+  frame.
 """
 
 from __future__ import annotations
@@ -27,17 +28,18 @@ from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 from gridsim.sensing.observation import SPEED_SCALE
 
 NO_ACTION = 255  # the action in an episode's last row, which has none
-UNITS = F(4096.0)  # fixed-point units per 1
+UNITS = F(4096.0)  # the fixed-point number that stands for 1
 _AREA = CELLS * CELLS
-_FRAME = _AREA // 4  # bytes
+_FRAME = _AREA // 4  # bytes of a stored frame
 _LEAST, _GREATEST = F(-32768.0), F(32767.0)
-# A network's inputs for the four cells of each byte: float32 [256, 4]. The unused fourth code means occupied.
+# `_CELLS_OF`, float32 [256, 4]: a network's inputs for the four cells that a byte of each value holds. The unused code
+# 3 means occupied.
 _SEEN = np.array([UNKNOWN, FREE, OCCUPIED, OCCUPIED]).astype(np.float32) * F(1.0 / 255.0)
 _CELLS_OF = freeze(_SEEN[np.arange(256)[:, None] >> np.arange(0, 8, 2) & 3])
 
 
 class Experience(NamedTuple):
-    """Concatenated episodes as arrays, with a row for each step and one more for each episode; see above."""
+    """Concatenated episodes as arrays, with a row for each step and one more for each episode (see the module)."""
 
     observations: np.ndarray  # int16 [rows, inputs] of rays, uint8 [rows, 1602] of grids
     actions: np.ndarray  # uint8 [rows]
@@ -123,9 +125,9 @@ def unpack(spec: PolicySpec, observations: np.ndarray, rows: np.ndarray, ages: n
 
     Args:
         observations: as in `Experience`, or a ring buffer of them, in which row 0 follows the last one.
-        rows: int64 [n], not checked.
-        ages: [n], `ages` of these rows; greater ages than spec.frames - 1 may be given as that. All rows that hold
-            frames of these stacks must still be there.
+        rows: int64 [n], which are not checked.
+        ages: [n], `ages` of these rows; any age above spec.frames - 1 may be given as spec.frames - 1. The rows with
+            the earlier frames of these stacks must not be overwritten yet.
     """
     inputs = np.empty((len(rows), spec.inputs), dtype=np.float32)
     if isinstance(spec, CnnSpec):

@@ -1,4 +1,4 @@
-"""The DQN learner: a Q network, its target network, and their updates. The only file with gradients.
+"""The DQN learner: a Q network, its target network, and their updates. No other file computes gradients.
 
 The Q network is a policy whose 8 outputs are the actions' values. So it can drive wherever a policy can.
 
@@ -34,7 +34,7 @@ from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS
 
 T = TypeVar("T", np.ndarray, float)
-RANDOM_SHARE = 0.02  # share of --anneal during which exploration falls from 1 to each episode's own share
+RANDOM_SHARE = 0.02  # share of the car-steps of --anneal in which exploration falls from 1 to an episode's final share
 SPREAD = 7.0  # exploration ranges from epsilon to epsilon ** (1 + SPREAD) (alpha of Horgan et al. 2018)
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
@@ -66,8 +66,8 @@ class DqnConfig:
 def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
     """Share of random actions in each episode of a batch: float32 [episodes].
 
-    In each episode it falls from 1 to that episode's own share. Args: `epsilon`, the first one's own share (later ones
-    have smaller ones); `progress`, car-steps so far, divided by --anneal; `episodes`, their number.
+    As the run progresses, each share falls from 1 to a final one: `epsilon` in the first episode of a batch, and less
+    in later ones. Args: `progress`, car-steps so far, divided by --anneal; `episodes`, their number.
     """
     usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
     random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)
@@ -140,7 +140,7 @@ def tanh(x: torch.Tensor) -> torch.Tensor:
 
 
 class QNetwork:
-    """A policy's network in PyTorch. Its parameters are one genome, of which the layers are views."""
+    """A policy's network in PyTorch. Its parameters are one genome; the layers are views of it."""
 
     def __init__(self, spec: PolicySpec, device: torch.device):
         self.spec = spec
@@ -177,7 +177,7 @@ def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
 
 
 class DqnLearner:
-    """A Q network in training; `seed` is that of its initial weights and its samples.
+    """A Q network in training; `seed` decides its initial weights and the transitions that are drawn.
 
     Raises: GridSimError for a missing device (`device_of`).
     """
@@ -210,7 +210,7 @@ class DqnLearner:
         return self._average.cpu().numpy().copy()
 
     def load_weights(self, genome: np.ndarray) -> None:
-        """Begin training with a genome float32 [genes]."""
+        """Set network, target network and average to a genome float32 [genes], with which training begins."""
         for tensor in (self.online.genome, self.target.genome, self._average):
             tensor.copy_(torch.from_numpy(genome))
 
@@ -227,7 +227,7 @@ class DqnLearner:
             return torch.addcmul(self._tensor(batch.rewards), self._tensor(batch.discounts), values)
 
     def loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-        """The loss [] of a batch, with gradients, and the values of its actions [n], without."""
+        """The loss [] of a batch, with gradients, and the values [n] of its actions, without gradients."""
         y, actions = self.targets(batch), self._tensor(batch.actions)[:, None]
         q = self.online(self._tensor(batch.observations)).gather(1, actions).squeeze(1)
         return torch.nn.functional.huber_loss(q, y, delta=self.config.huber_delta), q.detach()
@@ -256,8 +256,9 @@ class DqnLearner:
 
     @one_thread()
     def train(self, replay: Replay, updates: int) -> tuple[float, float]:
-        """Make updates from a replay; several calls give the same result as one. Returns: mean loss and mean value.
+        """Make updates from a replay; n and then m of them lead to the same weights as n + m at once.
 
+        Returns: mean loss and mean value.
         Raises: ValueError if the replay has no transitions; FloatingPointError as `update`.
         """
         made = []

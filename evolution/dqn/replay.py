@@ -31,7 +31,7 @@ class Batch(NamedTuple):
 
 @njit(nogil=True)
 def _draw(drawable, size, key, rows):
-    """Fill rows [n] uniformly with drawable rows below `size`."""
+    """Fill `rows` [n] with indices of drawable rows below `size`, drawn uniformly with replacement."""
     key, place = mix(key), U(0)
     for i in range(rows.shape[0]):
         row = 0
@@ -51,7 +51,7 @@ class Replay:
         self.added = 0  # rows added in total: the next one's place is added % capacity
         self.transitions = 0  # rows that can be drawn
         self._earlier_frames = spec.frames - 1 if isinstance(spec, CnnSpec) else 0
-        age = np.empty(capacity, dtype=np.uint8)  # earlier rows of the episode, at most `_earlier_frames`
+        age = np.empty(capacity, dtype=np.uint8)  # rows of its episode that precede a row, at most `_earlier_frames`
         self._rings = {**empty(spec, capacity)._asdict(), "ages": age}  # takes memory only as it fills
         self._drawable = np.zeros(capacity, dtype=np.bool_)
 

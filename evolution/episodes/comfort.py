@@ -11,7 +11,7 @@ from gridsim.state import COS, LANE, SIN, SPEED, X, Y
 
 # Entries of an episode's notes, float32 [NOTES].
 _COS, _SIN, _SPEED = 0, 1, 2  # the car's heading and speed (m/s) before the step
-_ALONG, _ACROSS = 3, 4  # m/s2, its acceleration in the step before
+_ALONG, _ACROSS = 3, 4  # m/s2, the car's acceleration in the previous step: forwards, and to the side
 _LATERAL, _PEAK, _JERK = 5, 6, 7  # lateral acceleration: sum of squares, and largest; jerk: sum of squares
 _GAP, _CLOSE = 8, 9  # m, least gap so far; steps with less than a second to the car ahead
 NOTES = 10
@@ -26,7 +26,7 @@ def begin(car, notes):
 
 @leaf
 def note(constants, road, car, world, steps, notes):
-    """Add a control step, after `steps` earlier ones. Accelerations are those of the changes of speed and heading."""
+    """Add to `notes` the control step after the first `steps`. Accelerations derive from changed speed and heading."""
     per_s = ONE / constants.dt
     turned = math.atan2(
         notes[_COS] * car[SIN] - notes[_SIN] * car[COS], notes[_COS] * car[COS] + notes[_SIN] * car[SIN]

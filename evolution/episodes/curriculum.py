@@ -29,7 +29,7 @@ from gridsim.state import TERMINATES, End
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
-FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, for the choice that ends a run
+FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, to choose the champion when a run ends
 LEAST_CRASH_WEIGHT = 0.05  # floor of the weight 4p(1 - p) of a crash start, p the share of members that fail there
 
 
@@ -38,7 +38,7 @@ class CurriculumConfig:
     """The curriculum's parameters."""
 
     maps: int = 128  # training maps
-    first_maps: int = 4  # of these, how many the first generation uses; each later one uses one more
+    first_maps: int = 4  # training maps that the first generation uses; each later generation uses one more
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes for each group and generation
     crash_starts: int = 1  # short episodes for each group and generation that start before a crash of a recent leader
@@ -53,9 +53,9 @@ class CurriculumConfig:
     growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
     # Of each road, m/s: mean speed that a training episode's time limit requires. The default is for `seamless`.
     pace: tuple[float, ...] = (7.0,)
-    slack: float = 3.0  # s, added to that time limit
-    promising: float = 0.5  # least mean success rate of the leaders of the `latest` generations for a validation
-    latest: int = 4  # generations
+    slack: float = 3.0  # s, added to the time limit that follows from `pace`
+    promising: float = 0.5  # least mean success rate of recent leaders to validate one, or the champion's if greater
+    latest: int = 4  # generations whose leaders' success rates are averaged for `promising`
     validation_share: float = 0.25  # largest share of validation in all car-steps
     validation: int = 256  # episodes of validation on each road
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
@@ -75,10 +75,11 @@ IN_TRAFFIC: dict[str, Any] = {
 def spread_starts(
     build: Callable[[int], Map], seeds: range, episodes: int, crowds: Sequence[int], config: SimConfig, room: int = 0
 ) -> Episodes:
-    """Full episodes, `episodes` on each road, one road after the other; a road's are on its maps of `seeds` in turn.
+    """Episodes with the full target and time limit: `episodes` on each road, one road after the other.
 
-    A road's episodes are the same whichever other roads there are. Args: `build` makes the map of a seed; `crowds`, the
-    number of other cars on each road; `room`, the least number of cars in the arrays, as in `lane_starts`.
+    A road's episodes take turns on its maps of `seeds`, and do not depend on the other roads. Args: `build` makes the
+    map of a seed; `crowds`, the number of other cars on each road; `room`, the least number of cars in the arrays, as
+    in `lane_starts`.
     """
     used, roads = np.arange(episodes) % len(seeds), list[Episodes]()
     for k, traffic in enumerate(crowds):
@@ -116,7 +117,7 @@ class Curriculum:
     def _starts(
         self, seeds: Sequence[int], maps: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Training episodes on the maps of `seeds` that `maps` [e] indexes, and their traffic."""
+        """Training episodes and their traffic; `maps` [e] gives the map of each as an index into `seeds`."""
         cars, room = [self.training_crowds[road_number(seed, self.roads)] for seed in seeds], max(self.training_crowds)
         return lane_starts([self.build(seed) for seed in seeds], maps, rng, cars, self.sim, room)
 
@@ -151,7 +152,7 @@ class Curriculum:
         return Episodes(seeds, *self._starts(seeds, local, rng))
 
     def episodes(self, generation: int) -> Episodes:
-        """A generation's episodes, group by group: in each group so many new starts, then so many crash starts."""
+        """A generation's episodes, group by group: for each group first its new starts, then its crash starts."""
         config, rng = self.config, self._rng(generation, 0)
         # If a group has too few new starts for all roads, other groups and the next generations have the other roads.
         firsts = [(generation + group) * config.starts for group in range(config.groups)]
@@ -171,7 +172,10 @@ class Curriculum:
         return Episodes(used, self._by_group(fresh.rows, crashes), worlds)
 
     def _choose_crashes(self, generation: int) -> np.ndarray:
-        """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
+        """Choose a generation's crash starts, group by group, as indices into `crashes`.
+
+        Crashes where half of the members failed again are the likeliest.
+        """
         count = self.config.groups * self.config.crash_starts
         weights = np.maximum(4.0 * self.failures * (1.0 - self.failures), LEAST_CRASH_WEIGHT)
         rng, shares = self._rng(generation, 1), weights / weights.sum()
@@ -194,12 +198,12 @@ class Curriculum:
         return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
-        """`count` new full episodes on the training maps. They differ by `purpose`; by default they are for the DQN."""
+        """`count` new full episodes on the training maps, seeded by `batch` and `purpose` (by default, the DQN's)."""
         rng = self._rng(batch, purpose)
         return self._new_starts(self._some_maps(batch, count, rng, batch * count), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
-        """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
+        """The episodes that the leader drives in a generation, with `rewind` set so that crashes give crash starts."""
         episodes = self.starts(generation, self.config.leader_episodes, purpose=2)
         self._limit(episodes.rows, episodes.maps, min(self.config.leader_stretch * self.target, self.goal))
         episodes.rows["rewind"] = self.config.rewind
@@ -208,10 +212,11 @@ class Curriculum:
     def learn_from_leader(
         self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray
     ) -> None:
-        """Learn from the leader's episodes: remember its crashes (terminating ends); if it succeeds, raise the target.
+        """Remember the leader's crashes; raise the target if a share of at least `growth` of its episodes reaches it.
 
-        Args: `episodes` of `leader_episodes`; `results` RESULT [e]; `rewound`, the states `rewind` steps before their
-        ends, as starts float32 [e, 8]; `worlds`, the traffic at that time, float32 [e, cars, TRAFFIC_FIELDS].
+        Crashes are terminating ends after more than 10 steps. Args: `episodes`, those of `leader_episodes`; `results`
+        RESULT [e]; `rewound`, the states `rewind` steps before their ends, as starts float32 [e, 8]; `worlds`, the
+        traffic at that time, float32 [e, cars, TRAFFIC_FIELDS].
         """
         crashed = TERMINATES[results["end"]] & (results["steps"] > 10)
         if crashed.any():
@@ -229,7 +234,7 @@ class Curriculum:
     def validation(self, seeds: range = VALIDATION_SEEDS) -> Episodes:
         """Validation's episodes on maps of `seeds`, the same for all runs of a scenario with the same traffic.
 
-        A task may hold them beside a generation's episodes, so their arrays have room for as many cars.
+        A call of the pool may hold them beside training episodes, so their arrays have room for as many cars as those.
         """
         if seeds not in self._validation:
             episodes, room = self.config.validation, max(self.training_crowds)
@@ -239,7 +244,7 @@ class Curriculum:
     def validation_scores(self, results: np.ndarray) -> np.ndarray:
         """Scores in [0, 1] on each road, float64 [roads], from a member's results in validation, RESULT [e].
 
-        They are success rates, times mean speed / champion_pace where that is below 1.
+        A score is the success rate, multiplied by mean speed / champion_pace if this ratio is below 1.
         """
         on_each = results.reshape(self.roads, -1)
         metres = on_each["distance"].astype(np.float64).sum(axis=1)

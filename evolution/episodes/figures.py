@@ -10,8 +10,8 @@ from gridsim.state import End
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
     """Means over the episodes of one member, RESULT [e]; `period_s` is the control period.
 
-    Kilometres per collision are the kilometres of all episodes, divided by their collisions. Without a collision they
-    are all kilometres, which is a lower bound.
+    Kilometres per collision are the kilometres of all episodes, divided by their collisions. Without a collision, the
+    figure is the kilometres of all episodes, which is a lower bound.
     """
     kilometres, collisions = results["distance"].sum(dtype=np.float64) / 1000.0, results["end"] == End.COLLISION
     return {

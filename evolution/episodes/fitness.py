@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 LINEAR_SHARE = 0.4  # share of the score that is linear in the distance; on a log scale, the last km counts for little
-PACED_SHARE = 0.7  # weight of the paced distance in the scalar; the rest is for the distance
-PACED_ENOUGH = 0.8  # if this share of the distance is paced, all of it counts: braking for others costs nothing
+PACED_SHARE = 0.7  # weight of the paced distance in the weighted mean; the rest is the weight of the distance
+PACED_ENOUGH = 0.8  # if this share of the distance is paced, all counts as paced: braking for others costs nothing
 
 
 def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Drives episodes in one fused kernel: sense, network, act, advance until the end.
+"""Drives episodes in one fused kernel: in each step it senses, asks the network for an action, and moves the cars.
 
 `evaluate` drives whole populations; `collect` drives one policy with some random actions and records its experience.
-Results depend only on the arguments; experience of an episode only on its own row, world, epsilon and key.
+Results depend only on the arguments. In `collect`, an episode's experience does not depend on the other episodes.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from gridsim.step import look, place, simulations_on, start_from, step, visit_ce
 
 _IDLE = int(End.IDLE)
 
-#: An episode: index of its map in the task; its start (`state.START_FIELDS`), target (m of new ground) and time limit
-#: (control steps); rewind: if above 0, return the state that many control steps before the end.
+#: An episode: index of its map in a list of maps; start (`state.START_FIELDS`); target (m of new ground); time limit
+#: (control steps); rewind: if above 0, the state that many control steps before the end is returned.
 EPISODE = np.dtype(
     [("map", "<i4"), ("start", "<f4", START_FIELDS), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")]
 )
@@ -59,7 +59,7 @@ Buffers = tuple[GridBuffers | None, np.ndarray | None]
 
 
 def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
-    """Buffers for grids, if the policy sees grids, and for pedal and wheel, float32 [2], if it sets these; else None.
+    """A GridBuffers, or None for a policy on rays, and float32 [2] for pedal and wheel, or None for discrete actions.
 
     Raises: GridSimError if the sensor has a wrong number of rays.
     """
@@ -84,15 +84,15 @@ class Workspace(NamedTuple):
     """State and buffers of an episode; reused for the next one."""
 
     car: np.ndarray  # float32 [CAR_FIELDS]
-    visits: np.ndarray  # float32 [cells]
+    visits: np.ndarray  # float32 [visit cells], the car's odometer (m) at its latest visit
     ranges: np.ndarray  # float32 [rays]
     closing: np.ndarray  # float32 [rays], closing speeds of other cars, m/s; [0] if the policy does not see them
     observation: np.ndarray  # float32 [values]
-    scratch: np.ndarray  # float32, of the network
-    ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
-    world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
+    scratch: np.ndarray  # float32, buffer of a perceptron's forward pass
+    ring: np.ndarray  # float32 [n, CAR_FIELDS], the car before each of the last n steps: step k in row k % n
+    world_ring: np.ndarray  # float32 [n, cars, fields], the traffic before each of these steps, in the same rows
     history: History | None  # None without delays of readings and commands
-    command: np.ndarray | None  # float32 [2], pedal and wheel, of a policy that has these in place of actions
+    command: np.ndarray | None  # float32 [2], pedal and wheel; None for a policy with discrete actions
 
 
 @leaf
@@ -104,7 +104,7 @@ def _copy(state, kept):
 
 @leaf
 def _copy_world(world, kept):
-    """Copy a world [cars, fields]."""
+    """Copy the traffic's state [cars, fields]."""
     for j in range(world.shape[0]):
         for i in range(world.shape[1]):
             kept[j, i] = world[j, i]
@@ -112,7 +112,7 @@ def _copy_world(world, kept):
 
 @leaf
 def _keep(workspace, car, world, step):
-    """Keep the states before a step in the workspace's rings."""
+    """Keep the states of car and traffic before a step in the workspace's rings."""
     _copy(car, workspace.ring[step % workspace.ring.shape[0]])
     if world is not None:
         _copy_world(world, workspace.world_ring[step % workspace.world_ring.shape[0]])
@@ -142,16 +142,16 @@ def packed_genome(genome, layers, grid_buffers):
 
 
 class Recorder(NamedTuple):
-    """Where an episode's experience is written, and its exploration."""
+    """Where an episode's experience is written, and what decides its random actions."""
 
-    experience: Experience  # room for a row more than the episode's time limit in steps
+    experience: Experience  # room for one row more than the episode's time limit in steps
     epsilon: np.float32  # share of random actions, which are uniform over all actions
     key: np.uint64  # seed of the episode's random numbers
 
 
 @leaf
 def _observe(simulation, car, world, workspace, grid_buffers):
-    """Look around, then compute the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
+    """Look around, then write the network's inputs: on rays to `workspace.scratch`, else the grid to `grid_buffers`."""
     ranges, closing, observation = workspace.ranges, workspace.closing, workspace.observation
     look(simulation, car, world, ranges, closing, observation, workspace.history)
     if grid_buffers is None:
@@ -162,13 +162,13 @@ def _observe(simulation, car, world, workspace, grid_buffers):
 
 @exact
 def _observed_speed(simulation, observation):
-    """The speed (m/s) that a network on the grid sees: the observation's last value, a share of the speed limit."""
+    """The speed (m/s) that a network on the grid sees: the observation's last value times `vehicle.speed_limit`."""
     return observation[observation.shape[0] - 1] * simulation.constants.speed_limit
 
 
 @leaf
 def _record(simulation, car, workspace, grid_buffers, experience, row, gained, end):
-    """Record a row's observation, and the reward of the step before it, in which the car `gained` m of new ground."""
+    """Record a row's observation, and reward and end of the step before, in which the car `gained` m of new ground."""
     observations, actions, rewards, ends = experience
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
@@ -184,7 +184,7 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
 
 @leaf
 def _choose_action(simulation, packed, layers, workspace, grid_buffers, begun):
-    """The action (`policy.choose`) for the observation."""
+    """The action (`policy.choose`) for the latest observation; `begun` if that is the episode's first."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch, workspace.command)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
@@ -203,7 +203,7 @@ def _explore(recorder, steps, action, actions):
 
 @leaf
 def _act(constants, car, history, action, command):
-    """Acceleration and steering of an action, or of a command: pedal and wheel."""
+    """Acceleration (m/s2) and steering (rad) of an action, or of a command (pedal and wheel), late by `history`."""
     if command is None:
         late, _ = late_command(history, car, F(action), ZERO, NEUTRAL)
         return act(constants, I(late), car[SPEED], car[STEERING])
@@ -215,7 +215,7 @@ def _act(constants, car, history, action, command):
 def _drive(simulation, setup, car, workspace, world, action):
     """One control step with an action. Returns an End as a number.
 
-    A `leaf`, which counts no references. Inside `run_episode` this code would, and be 15 % slower among 8 cars.
+    As a `leaf`, this code counts no references. Written into `run_episode`, it would, and be 15 % slower among 8 cars.
     """
     acceleration, steering = _act(simulation.constants, car, workspace.history, action, workspace.command)
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
@@ -227,8 +227,9 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
 
     Args: notes, float32 [comfort.NOTES], sum up the figures of comfort; with None the result does not get these.
 
-    If an output of the network is NaN, the episode ends as IDLE, and so does the last step of its recording. What may
-    be None is no field of a record but an argument: Numba prunes `is None` branches on arguments but not on fields.
+    If an output of the network is NaN, the episode ends as IDLE, which is also recorded as the end of the last step.
+    `world`, `grid_buffers`, `recorder` and `notes` may be None. They are arguments, not fields of a record, because
+    Numba prunes `is None` branches on arguments but not on fields.
     """
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
@@ -236,7 +237,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
     if notes is not None:
         comfort.begin(car, notes)
     if keep > 0:
-        _keep(workspace, car, world, 0)  # for an episode that ends before its first step, as an output is NaN
+        _keep(workspace, car, world, 0)  # for an episode that ends before its first step because an output is NaN
     while True:
         if recorder is None and end != 0:
             break
@@ -327,8 +328,8 @@ def evaluate(
 
     Args: `genomes` float32 [n, spec.size]; `road_maps`, which the episodes index; `episodes` EPISODE [e]; `worlds`, the
     traffic at their starts, float32 [e, cars, TRAFFIC_FIELDS]; `with_comfort`: results have the figures of comfort.
-    Returns: (RESULT [n, e]; for the k episodes with `rewind` above 0, the states that many steps before their ends, or
-    at the start of shorter ones, as starts float32 [n, k, 8]; the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
+    Returns: (RESULT [n, e]; for the k episodes with `rewind` above 0, states `rewind` steps before their ends, or at
+    the start of shorter ones, as starts float32 [n, k, 8]; the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if the genomes do not fit or a time limit is out of range.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -410,7 +411,7 @@ def trajectory(
 
     Args: as `evaluate`'s; start, target and steps as in EPISODE, world float32 [cars, TRAFFIC_FIELDS].
     Returns: (RESULT []; the car's states before each driven step and at the end, float32 [driven + 1, CAR_FIELDS]; the
-    traffic then, float32 [driven + 1, cars, TRAFFIC_FIELDS]).
+    traffic at the same times, float32 [driven + 1, cars, TRAFFIC_FIELDS]).
     """
     simulation = simulations_on([road_map], config.drawn(start), spec.features)[0]
     cars = 0 if world is None else len(world)

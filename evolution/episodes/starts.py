@@ -38,11 +38,11 @@ def lane_starts(
     config: SimConfig | None = None,
     room: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
+    """Episodes that start at rest with `traffic` other cars, the k-th uniformly over the lanes of `road_maps[maps[k]]`.
 
     They have the configuration's target and time limit.
-    Args: `traffic`, one number for all maps or one for each; `room`, the least number of cars in the arrays, of which
-    those beyond `traffic` are absent.
+    Args: `traffic`, one number for all maps or one for each; `room`, the least number of cars that the arrays have
+    places for. Cars beyond `traffic` are absent.
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), cars, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()

@@ -42,9 +42,9 @@ class Scratch(NamedTuple):
     """Buffers of a forward pass for one car: float32."""
 
     frames: np.ndarray  # [frames * 6400] cells of the frames, the newest last, in [0, 1]
-    first: np.ndarray  # [19 * 19 * channels]
-    second: np.ndarray  # [8 * 8 * channels + 1], the speed last
-    dense: np.ndarray  # [units]
+    first: np.ndarray  # [19 * 19 * channels], outputs of the first convolution
+    second: np.ndarray  # [8 * 8 * channels + 1], outputs of the second convolution, then the speed
+    dense: np.ndarray  # [units], outputs of the dense layer
     outputs: np.ndarray  # [outputs]
 
 
@@ -57,7 +57,7 @@ def scratch(spec: CnnSpec) -> Scratch:
 
 @leaf
 def push(grid, begun, scratch):
-    """Append grid uint8 [6400] as the newest frame; if the episode has just `begun`, as all frames."""
+    """Add a grid uint8 [6400] as newest frame, drop the oldest; if the episode has just `begun`, fill all frames."""
     frames = scratch.frames
     older = frames.shape[0] - _AREA
     for i in range(older):
@@ -71,7 +71,7 @@ def push(grid, begun, scratch):
 
 @leaf
 def forward(genome, layers, speed, scratch):
-    """Outputs of the network for the frames in `scratch` and a speed in m/s; left in `scratch.outputs`.
+    """Write the network's outputs for the frames in `scratch` and a speed in m/s to `scratch.outputs`.
 
     Args: genome float32 [genes]; layers of `CnnSpec.layers`. A NaN anywhere reaches the outputs.
     """
@@ -129,7 +129,7 @@ def forward(genome, layers, speed, scratch):
 
 @leaf
 def decide(genome, layers, speed, scratch, command):
-    """The network's action for the frames and the speed, as `policy.choose` returns it."""
+    """Choose an action for the frames in `scratch` and a speed in m/s; `command` and result as in `policy.choose`."""
     forward(genome, layers, speed, scratch)
     return choose(scratch.outputs, 0, scratch.outputs.shape[0], command)
 

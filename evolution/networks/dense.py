@@ -15,13 +15,14 @@ from numba.core.extending import intrinsic
 
 
 def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """A function for kernels: biases plus weights times inputs, for `positions` x `lanes` (units); ReLU if `rectify`.
+    """Make a function for kernels: biases plus weights times inputs, of `lanes` units at `positions` positions.
 
-    Its arguments are float32 arrays of any length, offsets in them and strides: inputs `x`, the first position `x_at`
-    and the stride `x_step` of positions; number and stride of planes, number and stride of rows, length `run` of a run;
-    weights `w` from `w_at` on, the units `width` of the whole layer, biases from `bias_at` on in `w`; outputs `y`,
-    `y_at` and `y_step`. Each run is summed in `chains` independent parts, which hides the latency of additions where
-    there are few lanes and positions; the order of sums is the same on any machine.
+    If `rectify`, the function applies ReLU. Its arguments are float32 arrays of any length, offsets in them and
+    strides: inputs `x`, from `x_at` on, with stride `x_step` of positions; number and stride of planes, number and
+    stride of rows, length `run` of a run; weights `w`, from `w_at` on, with `width` units in the whole layer; biases,
+    also in `w`, from `bias_at` on; outputs `y`, from `y_at` on, with stride `y_step` of positions. Each run is summed
+    in `chains` independent parts, which hides the latency of additions where there are few lanes and positions; the
+    order of sums is the same on any machine.
     """
 
     @intrinsic

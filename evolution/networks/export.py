@@ -1,8 +1,9 @@
-"""Policies outside GridSim: as an ONNX graph from the environment's observations to its actions, n at a time.
+"""Export of policies to ONNX: a graph computes n actions from n of the environment's observations.
 
-Inputs: `observation`, float32 [n, inputs]; on the grid `grid`, uint8 [n, frames, 80, 80], and `speed`, float32 [n, 1].
-Outputs: `outputs`, float32 [n, 8], which are the kernels' up to rounding, and `action`, int64 [n], the index of the
-largest one. With continuous actions only `action`, float32 [n, 2], pedal and wheel, each within [-1, 1].
+Inputs of an `mlp`: `observation`, float32 [n, inputs]. Inputs of a `cnn`: `grid`, uint8 [n, frames, 80, 80], and
+`speed`, float32 [n, 1], a share of `vehicle.speed_limit`. Outputs if actions are discrete: `outputs`, float32 [n, 8],
+equal to those of the kernels up to rounding, and `action`, int64 [n], the index of the largest output. If actions are
+continuous, the only output is `action`, float32 [n, 2]: pedal and wheel, each within [-1, 1].
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def _add_cnn(graph: _Graph, spec: CnnSpec, genome: np.ndarray, config: SimConfig
     """Add a convolutional network to a graph. Returns: the name of its outputs."""
     one, two, _ = spec.hidden
     (w1, b1), (w2, b2), dense, last = layers_of(spec, genome)
-    x = graph.add("Mul", graph.add("Cast", "grid", to=1), graph.constant(1.0 / 255.0))  # 1 is float32
+    x = graph.add("Mul", graph.add("Cast", "grid", to=1), graph.constant(1.0 / 255.0))  # to=1: float32
     # A genome orders a unit's inputs (frame, row, column) in the first layer, (row, column, channel) in the second.
     w1 = w1.reshape(spec.frames, KERNEL_1, KERNEL_1, one).transpose(3, 0, 1, 2)
     w2 = w2.reshape(KERNEL_2, KERNEL_2, one, two).transpose(3, 2, 0, 1)

@@ -27,7 +27,7 @@ ACTIONS = 8
 MAX_GENES = 1_000_000
 COMMAND_SCALE = 0.5  # scale of the genes of the outputs pedal and wheel; with 1 both are mostly at their limits
 
-_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # regular expression of a specification's end
+_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # matches optional features
 
 Observation = Literal["rays", "grid"]
 Actions = Literal["discrete", "continuous"]
@@ -42,7 +42,7 @@ class PolicySpec(ABC):
 
     hidden: tuple[int, ...]  # units, or channels, of the hidden layers
     actions: Actions = field(default="discrete", kw_only=True)
-    features: tuple[str, ...] = field(default=(), kw_only=True)  # optional ones that it sees, in the order of OPTIONAL
+    features: tuple[str, ...] = field(default=(), kw_only=True)  # optional inputs of the network, ordered as OPTIONAL
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
@@ -76,7 +76,7 @@ class PolicySpec(ABC):
 
     @property
     def outputs(self) -> int:
-        """Number of outputs: one for each action, of which the largest is chosen, or two, pedal and wheel."""
+        """Number of outputs: 8 for discrete actions, of which the largest is chosen, or 2, pedal and wheel."""
         return ACTIONS if self.actions == "discrete" else 2
 
     @property
@@ -96,7 +96,7 @@ class PolicySpec(ABC):
 
     @abstractmethod
     def shapes(self) -> tuple[tuple[int, int], ...]:
-        """(inputs of a unit, units) of each layer, including the outputs."""
+        """(inputs of a unit, units) of each hidden layer and of the output layer."""
 
     @property
     def size(self) -> int:
@@ -123,7 +123,7 @@ class MlpSpec(PolicySpec):
 
     @property
     def layers(self) -> np.ndarray:
-        """Units of each layer, inputs and outputs included: int32 [layers + 1]."""
+        """Sizes from the inputs through the hidden layers to the outputs: int32 [hidden layers + 2]."""
         return freeze(np.array([self.inputs, *self.hidden, self.outputs], dtype=np.int32))
 
     def shapes(self) -> tuple[tuple[int, int], ...]:
@@ -133,8 +133,8 @@ class MlpSpec(PolicySpec):
 # Kernels and strides of the convolutions of Mnih et al. (2015), which the paper's authors use for their grid.
 KERNEL_1, STRIDE_1 = 8, 4
 KERNEL_2, STRIDE_2 = 4, 2
-SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
-SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
+SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, side of the first convolution's output
+SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8, side of the second convolution's output
 UNIT_MULTIPLE = 8  # channels and units are multiples of this, so that layers are whole vectors
 
 
@@ -143,12 +143,12 @@ class CnnSpec(PolicySpec):
     """A convolutional network on the occupancy grid and the speed: ReLU hidden layers, linear outputs.
 
     Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer with the speed as a further input, and
-    the outputs. `cnn:16,32,256@4` has the channels of the convolutions, the units of the dense layer, and the frames:
-    the grids of that many consecutive control steps, the newest last. `cnn` alone means this network, which is that of
-    the paper's authors plus the speed; without `@` there are 4 frames.
+    the outputs. `cnn:16,32,256@4` gives the channels of both convolutions, the units of the dense layer, and the number
+    of frames. Frames are the grids of consecutive control steps, the newest last. `cnn` alone means this network, which
+    is that of the paper's authors plus the speed; without `@` there are 4 frames.
 
-    A unit's inputs are ordered (frame, row, column) in the first layer, (row, column, channel) in the others; the
-    speed is the dense layer's last.
+    A unit's inputs are ordered (frame, row, column) in the first convolution, and (row, column, channel) in the second
+    convolution and the dense layer. The last input of the dense layer is the speed.
     """
 
     observation = "grid"
@@ -165,7 +165,7 @@ class CnnSpec(PolicySpec):
 
     @property
     def layers(self) -> np.ndarray:
-        """Frames, channels, channels, units, outputs: int32 [5]."""
+        """Frames, channels of both convolutions, units of the dense layer, outputs: int32 [5]."""
         return freeze(np.array([self.frames, *self.hidden, self.outputs], dtype=np.int32))
 
     def shapes(self) -> tuple[tuple[int, int], ...]:
@@ -182,10 +182,10 @@ class CnnSpec(PolicySpec):
 def gene_scales(spec: PolicySpec) -> np.ndarray:
     """The scale of each gene, float32 [genes]: the spread of new genomes and of mutations is proportional to it.
 
-    1 for a perceptron, whose few inputs are alike, but COMMAND_SCALE in the layer of pedal and wheel. In a
-    convolutional network, the standard deviation of He et al. (2015), sqrt(2 / inputs of the unit), so that a step has
-    the same effect in a layer of 64 inputs as in one of 2,000; half that variance in the linear output layer. The
-    speed's weights have scale 1, because it is one input among a thousand and would have no effect otherwise.
+    In a perceptron, whose few inputs are alike, it is 1, but COMMAND_SCALE in the output layer of pedal and wheel. In a
+    convolutional network, it is the standard deviation of He et al. (2015), sqrt(2 / inputs of the unit), so that a
+    step has the same effect in a layer of 64 inputs as in one of 2,000; the linear output layer has half that variance.
+    Weights of the speed have scale 1: it is one input among a thousand and would have no effect otherwise.
     """
     shapes = spec.shapes()
     if spec.observation == "rays":
@@ -196,7 +196,7 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
         return freeze(scales)
     parts = []
     for k, (n, m) in enumerate(shapes):
-        beside = 1 if k == len(shapes) - 2 else 0  # the speed
+        beside = 1 if k == len(shapes) - 2 else 0  # the speed, an input of the dense layer
         size = np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / (n - beside))
         parts += [np.full((n - beside) * m, size), np.ones(beside * m), np.full(m, size)]
     return freeze(np.concatenate(parts).astype(np.float32))
@@ -221,13 +221,13 @@ _dense_64, _dense_16, _dense_8 = tile(1, 64, False), tile(1, 16, False, 2), tile
 
 @leaf
 def _padded(units):
-    """The next multiple of BLOCK."""
+    """`units`, rounded up to a multiple of BLOCK."""
     return (units + BLOCK - 1) // BLOCK * BLOCK
 
 
 @njit
 def scratch_size(layers):
-    """Length of `forward`'s scratch: twice the widest layer."""
+    """Length of `forward`'s scratch: room for two layers, each as wide as the widest one plus BLOCK."""
     widest = 0
     for k in range(layers.shape[0]):
         widest = max(widest, layers[k])
@@ -295,7 +295,7 @@ def forward(packed, layers, scratch):
 
 @leaf
 def greatest(values, first, n):
-    """Index of the greatest in `values[first:first + n]`, of equal ones the first; -1 if one is NaN."""
+    """Index, 0 for `first`, of the greatest of `values[first:first + n]`; the first of ties; -1 if any is NaN."""
     best, index = values[first], 0
     number = best == best
     for k in range(1, n):
@@ -321,7 +321,7 @@ def choose(outputs, first, n, command):
 
 @leaf
 def decide(packed, layers, scratch, command):
-    """The action of a perceptron whose inputs are in `scratch`, as `choose` returns it."""
+    """Choose a perceptron's action for the inputs in `scratch`; `command` and result are as in `choose`."""
     return choose(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1], command)
 
 

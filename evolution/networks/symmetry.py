@@ -39,8 +39,8 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
     With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
     all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
-    Factors are those of the features (`Feature.mirror`) in their weights, -1 in the genes of the wheel, else 1; and 0
-    for a gene that would be its own opposite.
+    The factor of a bound gene (`Symmetry.factor`) is 0 if the gene would be its own opposite, -1 if it is a gene of
+    the output that steers, that of the feature (`Feature.mirror`) for weights of a perceptron's inputs, else 1.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
@@ -48,7 +48,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
         units, sign = np.arange(m)[::-1], np.ones((n + 1, m))
         if k == len(shapes) - 1:
             units = MIRRORED_ACTIONS if spec.actions == "discrete" else np.arange(2)
-            sign[:, 1] = 1.0 if spec.actions == "discrete" else -1.0  # of the wheel
+            sign[:, 1] = 1.0 if spec.actions == "discrete" else -1.0  # continuous: column 1 is the wheel
         if k == 0 and isinstance(spec, MlpSpec):
             sign[:n] *= mirrored(spec.features)[1][:, None]
         images += [(at + inputs[:, None] * m + units).ravel(), at + n * m + units]

@@ -1,1 +1,1 @@
-"""Searches (ask and tell): recombination of all winners, two parents; breeding from recipes; spaces."""
+"""Searches (ask and tell), which recombine all winners or two parents; breeding from recipes; spaces of genes."""

@@ -22,15 +22,15 @@ class SearchConfig:
     groups: int = 8  # of members; each group has its own episodes
     tournament: int = 4  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of the space's scales
-    # The generation from which the centre's steps shrink with the square root of generations, and its average spans
-    # more of them; 0: never. For tasks in which chance decides much, and would undo what was learned.
+    # From this generation on, the centre's steps shrink with the square root of the generation, and the average of
+    # centres spans more generations; 0: never. For tasks in which chance would otherwise undo what was learned.
     settled: int = 0
     elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate
 
 
 class Generation(NamedTuple):
-    """A generation to evaluate, or other members to be driven."""
+    """Members to evaluate, as recipes: a generation of a search, or copies of given genomes."""
 
     parents: np.ndarray  # float32 [p, genes], the rows that recipes refer to
     recipes: np.ndarray  # RECIPE [population]
@@ -56,7 +56,7 @@ class Search(ABC):
         self.space, self.config, self.seed = space, config, seed
         self.generation = 0  # completed generations
         self.asked: Generation  # the current generation
-        self.champion: np.ndarray | None = None  # the run's so far, float32 [genes]; some searches keep it as an elite
+        self.champion: np.ndarray | None = None  # of the run so far, float32 [genes]; some searches keep it as an elite
 
     @abstractmethod
     def start_from(self, genome: np.ndarray) -> None:
@@ -114,7 +114,7 @@ def split(members: int, groups: int, first: int = 0) -> list[slice]:
 
 
 def ranks(scores: np.ndarray, groups: Sequence[slice]) -> np.ndarray:
-    """Rank of each member in its group, float64 [n] in (0, 1): share of lower scores plus half the share of ties."""
+    """Rank of each member in its group, float64 [n] in (0, 1): share of lower scores plus half that of equal ones."""
     standing = np.empty(len(scores))
     for group in groups:
         _, place, count = np.unique(scores[group], return_inverse=True, return_counts=True)

@@ -1,4 +1,4 @@
-"""Breeding: genomes from recipes, by kernels with a counter-based generator.
+"""Breeding: genomes from recipes, by kernels with counter-based random numbers.
 
 A recipe is a few bytes. Together with the parents and the generation's key it determines the child, bit for bit, in
 every process.
@@ -18,7 +18,7 @@ from gridsim.jit import F, U, freeze, njit
 
 
 class Kind(IntEnum):
-    """How a child is made from the rows a and b of `parents` in its recipe."""
+    """How a child is made; its recipe's `a` and `b` are rows of `parents`."""
 
     COPY = 0  # parents[a], unmodified
     NEW = 1  # a random genome, symmetric (`space.Symmetry`), like the noise of STEP and MIRRORED
@@ -45,7 +45,7 @@ class Mutation:
     """Gaussian mutation."""
 
     rate: float = 0.03  # share of genes that get noise, in a child of two parents
-    sigma: float = 0.5  # its standard deviation, in units of the space's scales
+    sigma: float = 0.5  # standard deviation of the noise, in units of the space's scales
 
 
 @njit
@@ -56,7 +56,7 @@ def _stream(key, seed):
 
 @njit
 def _normals(quantiles, stream, scale, symmetry, out):
-    """out[i] = scale[i] * N(0, 1), symmetric; four numbers from each 64 random bits."""
+    """Fill out [genes] with symmetric noise, out[i] = scale[i] * N(0, 1); 64 random bits give four numbers."""
     n = out.shape[0]
     for block in range(n // 4):
         bits = mix(stream + U(block + 1) * GOLDEN)
@@ -76,7 +76,7 @@ def _normals(quantiles, stream, scale, symmetry, out):
 def _cross(a, b, stream, threshold, source, child, marked):
     """Uniform crossover; marks the genes to mutate. Bound genes are chosen like their sources (`space.Symmetry`).
 
-    Without branches, so that it is vectorised.
+    The loop has no branches, so that it is vectorised.
     """
     for i in range(child.shape[0]):
         bits = mix(stream + (source[i] + U(1)) * GOLDEN)
@@ -118,7 +118,7 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
 
 
 def breed(parents: np.ndarray, recipes: np.ndarray, key: int, space: Space, mutation: Mutation) -> np.ndarray:
-    """Children float32 [n, genes] of recipes RECIPE [n] over parents float32 [p, genes]."""
+    """Make the children float32 [n, genes] that recipes RECIPE [n] give with parents float32 [p, genes]."""
     if not len(parents):  # all are Kind.NEW
         parents = np.zeros((1, space.size), dtype=np.float32)
     children = np.empty((len(recipes), space.size), dtype=np.float32)
@@ -131,7 +131,7 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, space: Space, muta
 
 @njit
 def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
-    """Add weights[k] * z_k to total [genes], z_k the noise of seeds[k]."""
+    """Add to total [genes], for all k, weights[k] times the noise of seeds[k]."""
     z = np.empty(total.shape[0], dtype=np.float32)
     for k in range(seeds.shape[0]):
         if weights[k] == 0.0:
@@ -143,7 +143,7 @@ def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
 
 
 def noise_sum(seeds: np.ndarray, weights: np.ndarray, key: int, space: Space) -> np.ndarray:
-    """Sum float32 [genes] of weights [n] times the noise of Kind.STEP at sigma 1 with these seeds [n]."""
+    """Weighted sum float32 [genes] of the noise that Kind.STEP adds, at sigma 1, for each of the seeds [n]."""
     total = np.zeros(space.size, dtype=np.float32)
     _noise_sum(seeds.astype(np.uint32), weights, U(key), QUANTILES, space.scales, space.symmetry, total)
     return total

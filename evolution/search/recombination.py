@@ -16,10 +16,10 @@ from evolution.search.base import Generation, Search, SearchConfig, ranks, recip
 from evolution.search.breeding import Kind, Mutation, noise_sum
 from evolution.search.space import Space
 
-_CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
-_ELITES = 2  # the centre, and the champion or, before the first one, the average
-_LEARNING_RATE = 2.0  # of the mean, c_m of Hansen 2016 ("The CMA Evolution Strategy: A Tutorial"), by measurement
-_KEPT = 0.9  # decay of the average of centres in each generation
+_CENTRE, _OTHER = 0, 1  # rows of `Generation.parents`: the two elites
+_ELITES = 2  # the centre, and the champion (until there is one, the average of centres)
+_LEARNING_RATE = 2.0  # of the centre: c_m of Hansen 2016 ("The CMA Evolution Strategy: A Tutorial"), set by measurement
+_KEPT = 0.9  # share of the average of centres that each generation keeps; more once steps shrink (`settled`)
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
 _MAX_GROWTH = 2.0
@@ -64,7 +64,7 @@ class Recombination(Search):
         return Generation(rows, made, key, Mutation(sigma=self.sigma), split(n, self.config.groups, _ELITES))
 
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
-        if not len(self.centre):  # start from the best score, although groups had different episodes
+        if not len(self.centre):  # start from the member with the best score, although groups had different episodes
             self.start_from(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)

@@ -1,4 +1,4 @@
-"""What a search moves in: vectors of genes. It knows neither networks nor cars."""
+"""The space that a search explores: vectors of genes, independent of networks and cars."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Space:
     """Vectors of `size` genes. Raises: GridSimError if the scales or the mirror do not fit the size."""
 
     size: int
-    scales: np.ndarray  # float32 [size], above 0: of the spread of new genomes and of mutations
+    scales: np.ndarray  # float32 [size], above 0: relative spread of each gene in new genomes and mutations
     mirror: Symmetry | None = None  # None: all genes are free
 
     def __post_init__(self) -> None:
@@ -42,7 +42,7 @@ class Space:
 
     @cached_property
     def symmetry(self) -> Symmetry:
-        """The mirror as kernels read it."""
+        """`mirror` as kernels read it; without one, all genes are free."""
         none = np.zeros(0)
         free, bound, source, factor = self.mirror or Symmetry(np.arange(self.size), none, none, none)
         free, bound, source = (freeze(np.asarray(genes, dtype=np.int32)) for genes in (free, bound, source))

@@ -11,7 +11,7 @@ from evolution.search.base import Generation, Search, SearchConfig, ranks, recip
 from evolution.search.breeding import Kind, Mutation
 from evolution.search.space import Space
 
-PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
+PARENTS = 64  # size of the mating pool; it bounds how many genomes each worker is sent
 
 
 class TwoParents(Search):
@@ -23,7 +23,7 @@ class TwoParents(Search):
         super().__init__(space, config, seed)
         self.random = random
         self.parents = np.zeros((0, space.size), dtype=np.float32)  # elites, the best first, then the mating pool
-        self.elites = 0  # rows of `parents` that are elites
+        self.elites = 0  # number of rows of `parents` that are elites
 
     def start_from(self, genome: np.ndarray) -> None:
         self.elites = min(1, self.config.elites)

@@ -14,7 +14,7 @@ from typing import Any
 from gridsim.jit import HALF, ONE, ZERO, F, leaf
 from gridsim.state import SPEED, STEERING
 
-Parameters = type(None)  # a vehicle's constants are enough
+Parameters = type(None)  # this model reads nothing besides `Constants`
 
 
 def parameters(vehicle: Any) -> None:
@@ -32,7 +32,10 @@ def path_curvature(constants, speed, steering):
 
 @leaf
 def front_velocity(model, constants, car):
-    """Velocity of the front axle: the centre of mass moves at the slip angle, and the axle turns about it."""
+    """Velocity (m/s) of the front axle along the heading and to the left.
+
+    The centre of mass moves at the slip angle to the heading, and the axle turns about the centre of mass.
+    """
     speed, curvature = car[SPEED], path_curvature(constants, car[SPEED], car[STEERING])
     sine_slip = curvature * constants.rear_axle
     along = speed * math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))

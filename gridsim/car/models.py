@@ -1,7 +1,7 @@
 """The vehicle models: what moves a car within a control period. Each is a file like `single_track.py`, with
 
-* `Parameters` and `parameters(vehicle)`: a vehicle's numbers as kernels read them, a type of its own, so that kernels
-  are compiled for one model;
+* `Parameters` and `parameters(vehicle)`: a vehicle's numbers as kernels read them. Each model has a type of its own for
+  them, so that kernels are compiled for one model;
 * `move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt)`: moves for dt seconds with the
   car's steering angle. Args: pose (m, m, heading as cosine and sine), speed m/s, acceleration m/s2; curvature (1/m) of
   the kinematic model. Returns: (x, y, cosine, sine, speed, signed path length in m);
@@ -27,7 +27,7 @@ class Numbers(single_track.Numbers):
 
 
 def _by_model(name: str) -> Any:
-    """The function `name` for kernels: it calls that of the model whose `Parameters` the first argument is."""
+    """A function for kernels: it calls the function `name` of the model whose `Parameters` its first argument is."""
     functions = {model.Parameters: getattr(model, name) for model in MODELS.values()}
 
     def function(model, *rest):

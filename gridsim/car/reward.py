@@ -1,8 +1,8 @@
 """The paper's reward of a control step, for the environment and for the DQN's experience.
 
-0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a collision. f(distance) is the new ground of the
-step, and f(speed) the forward speed after it, both relative to driving at the scenario's upper speed and at most 1;
-min(S) is the shortest ray after the step, relative to the full range.
+0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a collision. f(distance) is the new ground gained
+in the step, and f(speed) the forward speed after the step, both relative to driving at the scenario's upper speed and
+at most 1; min(S) is the shortest ray after the step, relative to the full range.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ CRASH_REWARD = -1.0
 def reward(ranges, reach, speed, progress, end, fastest, dt):
     """Reward of one control step.
 
-    Args: after the step, ranges float32 [rays] and their full range (m), speed (m/s), new ground (m) and End; then the
-    scenario's upper speed (m/s) and the control period (s).
+    Args: `ranges` float32 [rays] (m) and `speed` (m/s) after the step; `reach`, the sensor's full range (m);
+    `progress`, the metres that the step added to the counted distance (`state.DISTANCE`); `end`, the End after the
+    step; `fastest`, the scenario's upper speed (m/s); `dt`, the control period (s).
     """
     if end == 1:
         return F(CRASH_REWARD)

@@ -1,13 +1,14 @@
 """The dynamic single-track model: linear tyres, and load that shifts between the axles as the car brakes.
 
 Althoff, Koschi, Manzinger 2017, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", model ST. With
-speed v, yaw rate w, slip angle b, steering angle d and acceleration a, the yaw rate and the slip angle follow
+speed v, yaw rate w, slip angle b, steering angle d, acceleration a, friction mu, mass m, yaw inertia I, height h of the
+centre of mass and its distances lf and lr to the axles, the yaw rate and the slip angle follow
 
     w' = mu m / (I L) (-(lf^2 F + lr^2 R) w / v + (lr R - lf F) b + lf F d)
     b' = mu / (v L) ((lr R - lf F) w / v - (R + F) b + F d) - w
 
-where F = C_f (g lr - a h) and R = C_r (g lf + a h) are the axles' stiffnesses under load, and L = lf + lr. Below
-KINEMATIC_BELOW, where these divide by almost nothing, w and b are the kinematic bicycle's.
+where F = C_f (g lr - a h) and R = C_r (g lf + a h) are the axles' stiffnesses under load, and L = lf + lr. At
+speeds below KINEMATIC_BELOW, where the equations divide by almost 0, w and b are the kinematic bicycle's.
 """
 
 from __future__ import annotations
@@ -106,6 +107,9 @@ def move(model, constants, car, curvature, x, y, cosine, sine, speed, accelerati
 
 @leaf
 def front_velocity(model, constants, car):
-    """Velocity of the front axle: the centre of mass moves at the slip angle, and the axle turns about it."""
+    """Velocity (m/s) of the front axle along the heading and to the left.
+
+    The centre of mass moves at the slip angle to the heading, and the axle turns about the centre of mass.
+    """
     along, aside = car[SPEED] * math.cos(car[SLIP]), car[SPEED] * math.sin(car[SLIP])
     return along, aside + constants.front_axle * car[YAW_RATE]

@@ -37,8 +37,8 @@ def brake(constants, most, speed):
 def act(constants, action, speed, steering):
     """Acceleration and steering of an action in one control period.
 
-    Returns: (acceleration m/s2, steering angle rad after the period). Without left or right the wheels return to the
-    centre. Braking ends at standstill; reverse continues backwards.
+    Returns: (acceleration m/s2, steering angle rad during the period). Without left or right, the wheels return to the
+    centre. BRAKE stops the car; REVERSE slows it down, too, but then drives it backwards.
     """
     target = ZERO
     if action == 1 or action == 5:
@@ -64,7 +64,7 @@ def act_continuous(constants, pedal, wheel, speed, steering):
     Above 0, pedal is a share of the maximum acceleration; below 0, of the maximum braking, which ends at standstill.
     There is no reverse gear. wheel is a share of the steering limit, left positive; the wheels turn towards it at the
     steering rate.
-    Returns: (acceleration m/s2, steering angle rad after the period).
+    Returns: (acceleration m/s2, steering angle rad during the period).
     """
     step = constants.steering_step
     target = min(max(wheel, -ONE), ONE) * constants.steering_limit

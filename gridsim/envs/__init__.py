@@ -1,1 +1,1 @@
-"""The environments of Gymnasium and Stable-Baselines3."""
+"""GridSim's environments for Gymnasium and Stable-Baselines3."""

@@ -18,13 +18,16 @@ from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import empty_worlds, spawn
 
-#: The maps of this process's environments, kept while one of them uses them.
+#: Maps by scenario, seed and configuration, shared by all environments of this process while one of them uses the map.
 _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
 
 
 @njit
 def _draw(keys, episodes, which, numbers, drawn):
-    """For the episodes of cars `which` [k]: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
+    """Draw for the current episodes of cars `which` [k].
+
+    Writes: `numbers` float64 [k, 2], two random numbers in [0, 1); `drawn` uint64 [k], the key of the traffic.
+    """
     for k in range(which.shape[0]):
         i = which[k]
         episode = mix(mix(keys[i]) + U(episodes[i]) * GOLDEN)
@@ -34,20 +37,20 @@ def _draw(keys, episodes, which, numbers, drawn):
 
 
 class Draws:
-    """What decides the episodes of a batch of cars.
+    """Draws the map, start and traffic of each episode, for a batch of cars.
 
     Attributes:
         keys: uint64 [n], each car's seed.
-        numbers: uint64 [n], each car's current episode, counted from its seeding.
+        numbers: uint64 [n], number of each car's current episode; 0 is its first one after it was seeded.
     """
 
     def __init__(
         self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, crowds: tuple[int, ...],
         config: SimConfig,
     ):  # fmt: skip
-        """Draw from these `maps`, or from that many from `map_seed` on, built when first needed.
+        """Draw from these `maps`; or from this number of maps, with seeds from `map_seed` on, built when first needed.
 
-        Args: other cars on each of the scenario's roads.
+        Args: `crowds`, the number of other cars on each of the scenario's roads.
         """
         self.scenario, self.crowds, self.config = scenario, crowds, config
         given = [] if isinstance(maps, int) else maps
@@ -68,7 +71,10 @@ class Draws:
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[list[Map], np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and worlds [k, cars, TRAFFIC_FIELDS] of the episodes of cars `which` [k]."""
+        """Maps [k], starts [k, 5] and traffic [k, cars, TRAFFIC_FIELDS] of the current episodes of cars `which` [k].
+
+        `map_seed` and `start` (as in `GridSimVectorEnv.reset`), if given, replace what would be drawn.
+        """
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -108,7 +114,7 @@ class Draws:
         return found
 
     def _checked_start(self, start: Any, which: np.ndarray, maps: list[Map]) -> np.ndarray:
-        """A caller's start, float32 [k, 5]."""
+        """The starts of cars `which` [k] from what a caller gave as `start`, checked: float32 [k, 5]."""
         vehicle, cars = self.config.vehicle, len(self.keys)
         try:
             starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (cars, 5))[which]

@@ -1,23 +1,24 @@
 """Gymnasium environments: the native vector environment, and a single environment that wraps it with one car.
 
-Observation:
+Observation (50 m, 30 m/s and 27 degrees are the default configuration's limits):
 
-* `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
-  between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
-  the steering angle as a share of 27 degrees, `route` four points of a route ahead, float32 [8]
-  (`gridsim.sensing.route`), `limit` the road's speed limit as a share of 30 m/s, and `mirrors` how far behind the next
-  cars are on the right and on the left, float32 [2], as shares of 20 m. These features are in
-  `gridsim.sensing.observation`.
-* `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
-  and `speed`, float32 [1], as a share of 30 m/s.
+* `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s. Optional features
+  (`gridsim.sensing.observation`) make it longer. `motion` inserts, between ranges and speed, the closing speed of the
+  car that each ray hits, float32 [rays], as a share of 30 m/s. After the speed, `steering` appends the steering angle
+  as a share of 27 degrees, `route` four points of a route ahead, float32 [8] (`gridsim.sensing.route`), `limit` the
+  road's speed limit as a share of 30 m/s, and `mirrors` how far behind the next cars are on the right and on the left,
+  float32 [2], as shares of 20 m.
+* `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the latest occupancy grids (`gridsim.sensing.grid`), the newest
+  last, and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (1.5 s without progress)
-has no penalty: the last step is rewarded like any other.
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (1.5 s without progress) ends
+an episode without a penalty: its last step is rewarded like any other.
 
-An episode depends only on its car's seed and its number: after `reset(seed=s)`, car i drives the episodes that a single
-environment drives after `reset(seed=s + i)`, whatever the other cars do.
+An episode's map, start and traffic depend only on its car's seed and on how many episodes the car had since it was
+seeded: after `reset(seed=s)`, car i gets the episodes that a single environment gets after `reset(seed=s + i)`,
+whatever the other cars do.
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum 
 class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Many cars at once, each in its own episode.
 
-    `autoreset_mode` says how the next episode begins. `NEXT_STEP`: in the step after the end, in which the car does not
-    drive. `SAME_STEP`: at once; info has the last observations as `final_obs`, an array of objects, and the last info
-    as `final_info`. `DISABLED`: the caller resets cars that have ended, by `reset(options={"reset_mask": mask})`.
+    `autoreset_mode` says when the next episode begins. `NEXT_STEP`: in the step after the end; in that step the car
+    does not drive. `SAME_STEP`: in the step of the end; info then has the ended episodes' last observations as
+    `final_obs`, an array of objects, and their last info as `final_info`. `DISABLED`: when the caller resets the cars
+    whose episodes have ended, by `reset(options={"reset_mask": mask})`.
 
     info, arrays [n]: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number
     of a `state.End`, whose docstring says which ends terminate and which truncate.
@@ -101,8 +103,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             scenario: a scenario's name, a map's file (which is one map), or several of these, separated by commas.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first map; the others' seeds follow.
-            traffic: other cars in each car's world: usual, heavy, a number, or one for each of several roads; None
-                means the scenario's default.
+            traffic: how many other cars there are around each car: usual, heavy, a number, or a tuple with a number for
+                each of several roads; None means the scenario's default.
             frames: grids in an observation, 1 to 8.
             render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
                 it only where there is a display.
@@ -192,7 +194,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
-        Raises: gymnasium.error.ResetNeeded where a reset is up to the caller.
+        Raises: gymnasium.error.ResetNeeded before the first reset, and with `DISABLED` if an episode has ended.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
@@ -245,7 +247,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._begin(which)
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
-        """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
+        """Begin the next episodes of the cars that `over` bool [n] marks.
+
+        Writes their first observations to `observations`. Returns: info, with the ended episodes' as `final_info`.
+        """
         which = np.flatnonzero(over)
         last = np.full(self.num_envs, None, dtype=object)
         for i in which.tolist():
@@ -262,7 +267,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Record what cars `which` sense, and all places for pictures; update the window; `begun` [n]: new episode."""
+        """Add what cars `which` sense to their frames. For pictures, add each car's place to its path; draw the window.
+
+        Args: `begun` bool [n], whether a car's episode has just begun.
+        """
         self._observer.take(begun[which], which)
         if self.render_mode is None:
             return
@@ -277,10 +285,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 self._window = Window(RENDER_SIZE)
             if not self._window.closed:
                 self._window.show(self._picture(0), self.metadata["render_fps"])
-                self._window.keys()  # a window whose events are not read is shown as hung; a user may close it
+                self._window.keys()  # reads events: else the window seems hung and cannot be closed by the user
 
     def _picture(self, i: int) -> np.ndarray:
-        """What car i's world looks like: uint8 [height, width, 3]."""
+        """A picture of car i and the road around it: uint8 [height, width, 3]."""
         from gridsim.view.render import Renderer  # here, because only pictures need it
 
         car, world, road_map = self.simulator.cars[i], self.simulator.worlds[i], self.simulator.maps[i]
@@ -292,7 +300,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._views[road_map].draw(car, boxes, self.simulator.ranges[i], path, (text,), route)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """With `rgb_array`, a picture uint8 [height, width, 3] for each car; `human` is drawn by step and reset."""
+        """With `rgb_array`, a picture uint8 [height, width, 3] for each car; else None: step and reset draw `human`."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() without a render_mode; use gymnasium.make(id, render_mode='rgb_array')")
             return None
@@ -343,11 +351,11 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        # gymnasium.make gives `max_episode_steps` only to its TimeLimit wrapper, after it sets this. The simulator gets
-        # the same limit, so that `info["end"]` tells when time is up.
+        # gymnasium.make gives `max_episode_steps` only to its TimeLimit wrapper, after it has set `spec`. The simulator
+        # gets the same limit, so that `info["end"]` tells when time is up.
         maker, simulator = sys._getframe(1), self.cars.simulator
         if maker.f_code is gymnasium.make.__code__:
-            named = maker.f_locals  # a later Gymnasium may name them otherwise: then only the wrapper has the limit
+            named = maker.f_locals  # if a later Gymnasium renames these variables, only the wrapper has the limit
             asked = named.get("max_episode_steps") or getattr(named.get("env_spec"), "max_episode_steps", None)
             if asked is not None and asked > 0:
                 simulator.max_steps = asked

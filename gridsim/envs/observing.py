@@ -40,7 +40,7 @@ class Observer:
             self.space = Dict({"grid": image, "speed": Box(low[-1:], np.ones(1, dtype=np.float32))})
 
     def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
-        """Add the newest frame of each of cars `which` [k]; if its episode has `begun` [k], it becomes all frames."""
+        """Add the newest grid to the frames of cars `which` [k]; it fills all frames if an episode has `begun` [k]."""
         if self._observation == "rays" or self._stack.shape[1] == 1:
             return
         stack, newest = self._stack[which], self._grids(which)
@@ -52,7 +52,7 @@ class Observer:
             self._stack[which] = stack
 
     def look(self, which: np.ndarray | slice = _ALL) -> Seen:
-        """Observations of cars `which`, after `take`; the caller owns them."""
+        """Observations of cars `which`, as new arrays; call `take` first."""
         numbers = self._simulator.observations[which]
         if self._observation == "rays":
             return numbers.copy() if isinstance(which, slice) else numbers

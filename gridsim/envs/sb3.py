@@ -19,13 +19,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class SB3VecEnv(VecEnv):
-    """All cars of `gymnasium.make_vec(id, num_envs, ...)`."""
+    """The vector environment `gymnasium.make_vec(id, num_envs, ...)` as a VecEnv."""
 
     def __init__(self, id: str, num_envs: int, **options: Any):
         self.cars: Any = gymnasium.make_vec(id, num_envs=num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **options)
         self.render_mode = self.cars.render_mode
         super().__init__(num_envs, self.cars.single_observation_space, self.cars.single_action_space)
-        self.metadata = self.cars.metadata  # SB3's own lacks the frame rate, and its films would then have 30
+        self.metadata = self.cars.metadata  # SB3's default has no frame rate; its videos would have 30 frames/s
 
     def reset(self) -> Any:
         """Begin an episode of each car, with the seeds and options set since the last reset. Returns: observations."""
@@ -76,7 +76,7 @@ class SB3VecEnv(VecEnv):
         setattr(self.cars, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Only `render`, which SB3 calls for a window. Raises: NotImplementedError otherwise."""
+        """Call `render`, as SB3 does for a window. Raises: NotImplementedError for any other method."""
         if method_name == "render":
             pictures = self.cars.render() or [None] * self.num_envs
             return [pictures[i] for i in self._get_indices(indices)]

@@ -16,16 +16,16 @@ class Atlas(NamedTuple):
     """Concatenated maps; all arrays read-only and C-contiguous."""
 
     field: np.ndarray  # `Road.field` of all maps
-    lanes: Network  # the arrays of all maps' networks
-    # int64 [maps + 1, 8], where each map's part of the field, points, lanes, crossings, stop lines, programs, their
-    # seconds and `yields` begin
+    lanes: Network  # the arrays of all maps' networks, concatenated; width, height and hand are those of map 0
+    # int64 [maps + 1, 8], where each map's part begins of the field, points, lanes, crossings, stop lines, programs,
+    # seconds of programs, and `yields`: a column for each
     bounds: np.ndarray
     sides: np.ndarray  # uint32 [maps, 2], columns and rows
-    sizes: np.ndarray  # float32 [maps, 9], the other fields of `Road`, and `Network.hand`
+    sizes: np.ndarray  # float32 [maps, 9], the fields of `Road` from `width` on, and `Network.hand`
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
-    """Concatenate maps. A single field, which may be large, is not copied."""
+    """Concatenate maps. The field of a single map, which may be large, is not copied."""
     *columns, width, height, hand = zip(*networks, strict=True)
     lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0], hand[0]])
     fields = [road.field for road in roads]

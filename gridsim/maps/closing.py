@@ -1,4 +1,4 @@
-"""What is closed by walls on a picture's road: the surroundings of a drawing, dead ends, and narrow places.
+"""Close parts of a picture's road with walls: the surroundings of a drawing, dead ends, and narrow places.
 
 All lengths are in units (`SimConfig.unit`).
 """
@@ -17,19 +17,19 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 NODE = 1.0 / CELLS_PER_UNIT
 DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # the largest clearance that the field holds
-MARGIN = 0.3  # free around a car, where we choose its place
-FAR = 30.0  # least extent of a road; where all is a dead end, a car can drive on this far from each start
+MARGIN = 0.3  # free space that a car needs on each side; less is enough at starts given in a file
+FAR = 30.0  # least extent of a road; if all of it is a dead end, a car must be able to drive this far from each start
 
 _CORNERS_TOO = np.ones((3, 3))  # a node's neighbours include those across its corners
-_LEAST_DRAWING = 0.05  # least share of the road that a drawing must enclose, or nothing around it is closed
+_LEAST_DRAWING = 0.05  # if a drawing encloses less than this share of the road, its surroundings are not closed
 
 _SIDE = 2  # nodes along a side of the cells in which dead ends are looked for
-_MOST_CELLS = 1 << 19  # of road; with more, nothing is closed, as the search for dead ends would take too much memory
+_MOST_CELLS = 1 << 19  # of road; if there are more, dead ends stay open, as the search would take too much memory
 _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
-_STRIDE = 1.5  # between two places of an arc that must be free, at most: no wall fits between them
-_SLACK = 0.5  # of road kept beside the places where a car fits: cells are coarse, and edges stay as they are drawn
-# Room on both sides of a car, and the radius of its bends relative to that of its tightest bend.
+_STRIDE = 1.5  # between two places of an arc that are checked to be free, at most: no wall fits between them
+_SLACK = 0.5  # by which road that is kept is wider than a car needs: cells are coarse, and edges must stay as drawn
+# For easy and for hard driving: room on each side of a car, and the radius of its bends / that of its tightest bend.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 
 
@@ -39,16 +39,16 @@ def needed(vehicle: VehicleConfig) -> float:
 
 
 def _distance(region: np.ndarray) -> np.ndarray:
-    """Distance of each node from a region, bool [rows, columns]."""
+    """Distance of each node from a region (bool [rows, columns]); infinite if the region is empty."""
     return ndimage.distance_transform_edt(~region) * NODE if region.any() else np.full(region.shape, math.inf)
 
 
 def without_surroundings(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     """Close what surrounds the drawing, in the field of a picture that has road along its border.
 
-    The surroundings are what a disc can reach from outside; it is so large that it does not slip through gaps in an
-    outline. Of the regions that the drawing encloses, those that have no wall in common with the surroundings are
-    closed, too, such as the middle of a race track between two lines. If hardly any road is inside, nothing is closed.
+    The surroundings are what a disc of radius DEEPEST can reach from outside the drawing; it is too large to slip
+    through gaps in an outline. Enclosed regions that share no wall with the surroundings are closed, too, such as the
+    infield of a race track that is drawn as two lines. If hardly any road is enclosed, nothing is closed.
     """
     room = needed(vehicle)
     reach = math.ceil(DEEPEST / NODE) + 1
@@ -67,10 +67,10 @@ def without_surroundings(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarra
 
 
 def _bends(cells: np.ndarray, radius: float) -> csr_matrix:
-    """How a car can move: a graph with vertex h * n + k for heading h at free cell k of n, and an edge for each arc.
+    """Graph of a car's moves: vertex h * n + k is heading h at free cell k of n, and each edge an arc over free cells.
 
-    Arcs lead to the next heading on the right, straight on, or to the left.
-    Args: free cells, bool [cells y, cells x], and the radius of arcs.
+    An arc turns by one heading to the right, leads straight on, or turns by one heading to the left.
+    Args: `cells`, bool [cells y, cells x], whether each cell is free; `radius` of the arcs.
     """
     arc, side = radius * _TURN, _SIDE * NODE
     shares = np.linspace(0.0, 1.0, math.ceil(arc / _STRIDE) + 1)[1:]
@@ -93,15 +93,17 @@ def _bends(cells: np.ndarray, radius: float) -> csr_matrix:
 
 
 def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Close what is narrow, dead ends, and what is not joined to the rest.
+    """Close narrow places, dead ends, and road that is not joined to the rest.
 
     What stays is the largest part of the road on which a car can drive forwards from anywhere to anywhere (strongly
-    connected). The car drives easy bends with much room beside it; if hard ones leave more than twice as much road, it
-    drives those. Nothing is closed if all road is a dead end, or if the road has more than _MOST_CELLS cells.
-    Returns: the field; and bool [headings, cells y, cells x], from where a car can drive on: within what stays; or if
-    all road is a dead end, for FAR; or if there are too many cells, True everywhere.
+    connected). The car is taken to need wide bends and much room (_EASY), unless more than twice as much road stays
+    with tight bends and little room (_HARD). Nothing is closed if all road is a dead end, or if it has more than
+    _MOST_CELLS cells.
+    Returns: the field; and bool [headings, cells y, cells x], whether a car can drive on from a cell with a heading:
+    within what stays; if all road is a dead end, for FAR; if there are too many cells, this is True everywhere.
     """
-    clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]  # of a cell: that of its freest node
+    # A cell's clearance is the largest of its nodes.
+    clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]
     if np.count_nonzero(clearance >= needed(vehicle)) > _MOST_CELLS:
         return nodes, np.ones((_TURNS, *clearance.shape), dtype=bool)
     tightest = math.hypot(vehicle.wheelbase / math.tan(math.radians(vehicle.steering_limit)), vehicle.rear_axle)
@@ -112,10 +114,10 @@ def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.nda
         bends = _bends(cells, ease * tightest)
         _, part = connected_components(bends, connection="strong")
         largest = (part == np.bincount(part, minlength=1).argmax()).reshape(_TURNS, -1)
-        ways[:, cells] = largest | np.roll(largest, _TURNS // 2, axis=0)  # also driven the other way
+        ways[:, cells] = largest | np.roll(largest, _TURNS // 2, axis=0)  # also in the opposite direction
         core = ways.any(axis=0)
         holes, _ = ndimage.label(~core)
-        core |= ~np.isin(holes, holes[~cells])  # the middle of a hall, which bends do not come back to
+        core |= ~np.isin(holes, holes[~cells])  # keep holes without walls, such as the middle of a hall
         found.append((np.count_nonzero(core), room, core, ways))
     _, room, core, ways = found[0] if found[0][0] >= found[1][0] / 2 else found[1]
     (box,) = ndimage.find_objects(core.astype(int)) or [(slice(0, 0), slice(0, 0))]

@@ -47,14 +47,14 @@ KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thre
 
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
-# Limits, from and to.
+# The least and the greatest value that a file may give.
 RESOLUTION = (0.001, 1.0)  # m a pixel
 PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
-SHORTEST_SIDE = 16  # units
+SHORTEST_SIDE = 16  # in units (`SimConfig.unit`), of the field
 UNKNOWN = 205  # of 255, the grey of unknown pixels in maps that robots save
 ALIKE = 0.8  # similarity (`difflib.SequenceMatcher.ratio`) above which an unknown key is a known one, misspelt
-MOST_BORDER = 0.5  # share of road on a picture's border, above which the border is taken for the surroundings
-MOST_CLOSED = 0.05  # share of the road; if as much is closed, or more, there is a warning
+MOST_BORDER = 0.5  # if this share of a picture's border, or more, is road, it is taken for a drawing's surroundings
+MOST_CLOSED = 0.05  # share of the road; a warning is given if this much of it, or more, is closed
 
 
 class MapWarning(UserWarning):
@@ -67,7 +67,7 @@ class MapFile:
 
     image: Path
     resolution: float = 1.0 / PIXELS_PER_M  # m a pixel
-    # x, y (m) of the picture's lower left corner in the file's own coordinates, and their heading (rad) along its rows
+    # In the file's own coordinates: x, y (m) of the picture's lower left corner, and the heading (rad) of its rows.
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     negate: bool = False  # whether dark pixels are road
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
@@ -79,7 +79,7 @@ class MapFile:
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:
-    """The map of a file; the same object as long as the file does not change.
+    """The map of a file, cached while neither the file nor the configuration changes.
 
     Warns (MapWarning) when it is built: of what is ignored or closed, if the road is very short, and if the picture
     seems inverted. Raises: GridSimError.
@@ -90,7 +90,7 @@ def load_map(name: str, config: SimConfig | None = None) -> Map:
 def map_digest(name: str) -> str:
     """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
     path = Path(os.path.abspath(name))
-    files = dict.fromkeys((path, read_map_file(path).image))  # a picture alone is a map, too
+    files = dict.fromkeys((path, read_map_file(path).image))  # both are one file if the map is a picture alone
     return hashlib.sha256(b"".join(hashlib.sha256(read_bytes(file)).digest() for file in files)).hexdigest()
 
 
@@ -116,7 +116,7 @@ def _numbers(value: Any, what: str, *limits: tuple[float, float]) -> list[float]
 
 
 def _checked(path: Path, values: Any) -> MapFile:
-    """The MapFile of a YAML's values. Raises: ValueError without the file's name."""
+    """The MapFile of a YAML's values. Raises: ValueError, whose message does not name the file."""
     if not isinstance(values, dict):
         raise ValueError(f"a map's YAML is a mapping with image and resolution, not {shown(values)}")
     ignored = [str(key) for key in values if key not in KEYS]
@@ -158,7 +158,7 @@ def _checked(path: Path, values: Any) -> MapFile:
 
 
 def _image_path(path: Path, image: Any) -> Path:
-    """The path of a YAML's picture, in its folder or below; else that of a picture of the same name in the folder."""
+    """The picture that a YAML names, in or below the YAML's folder; else one of the same file name in that folder."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
         raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {shown(image)}")
     try:
@@ -216,7 +216,7 @@ def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
 
 
 def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
-    """Columns and rows of the field, in nodes: powers of two; `pixel` in units."""
+    """Columns and rows of the field, in nodes: powers of two. A pixel's side is `pixel` units of `unit` m."""
     sides = []
     for axis in (0, 1):
         used = np.flatnonzero(free.any(axis=axis))
@@ -235,18 +235,17 @@ def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
 
 
 def _border(road: np.ndarray) -> float:
-    """Share of road on the border of bool [rows, columns]."""
+    """Share of the border of `road`, bool [rows, columns], that is road."""
     return float(np.concatenate([road[0], road[-1], road[:, 0], road[:, -1]]).mean())
 
 
 def _warnings(
     file: MapFile, border: float, inverted: bool, closed: float, length: float, revisit: float
 ) -> Iterator[str]:
-    """What a user should know of a map, each a sentence after its name.
+    """What a user should know of a map: texts that follow the map's name.
 
-    Args: `border`, the share of road on the picture's border; `inverted`, whether road and wall seem exchanged;
-    `closed`, the share of the road that is closed; `length` of the road, and `revisit`, within which the same ground
-    does not count again (m).
+    Args: `border`, the share of the picture's border that is road; `inverted`, whether road and wall seem exchanged;
+    `closed`, the share of the road that is closed; `length` of the road (m); `revisit`, `episode.revisit` (m).
     """
     if file.ignored:
         yield f"has keys in its YAML that mean nothing here: {', '.join(file.ignored)}"

@@ -27,15 +27,15 @@ class Scenario(NamedTuple):
     """A kind of road: its layout and its driving limitations (the paper's term)."""
 
     layout: Callable[[np.random.Generator], Plan]
-    speed_interval: tuple[float, float]  # m/s, within which speed counts
+    speed_interval: tuple[float, float]  # m/s, lowest and highest speed at which distance counts as `state.PACED`
     traffic: int = 0  # default number of other cars
     usual_traffic: int = 6  # the number that `usual` means, if the default is 0
-    thinnest: float = THICK_WALL  # m, of its walls and parked cars
+    thinnest: float = THICK_WALL  # m, least thickness of its walls and parked cars
     lit: Callable[[np.random.Generator], Plan] | None = None  # its layout with lights, for `traffic.city_lights`
 
 
 LANE_STEP = 1.0  # m between points of a lane, at most
-FORKS = 3  # most successors of a lane: straight on, left and right
+FORKS = 3  # most successors of a lane on generated roads: straight on, left and right; real roads may have more
 _SAME = 0.01  # m and rad within which one lane's end is another's beginning
 _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
@@ -86,7 +86,7 @@ def strips_along(path: Path, half_width: float) -> Strips:
         if curvature == 0.0:
             lines.append([x, y, end_x, end_y, half_width])
         else:
-            r = 1.0 / curvature  # signed: the centre is to the left or to the right
+            r = 1.0 / curvature  # signed: positive if the centre is to the left
             first = heading - math.copysign(math.pi / 2, r)
             arcs.append(
                 [x - r * math.sin(heading), y + r * math.cos(heading), abs(r), first, length * curvature, half_width]
@@ -124,7 +124,7 @@ def _sample_pieces(starts, pieces, piece_offsets, steps, offsets):
 
 
 def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of paths, as `_sample_pieces` computes them."""
+    """Points and end poses of paths; see `_sample_pieces`."""
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(-1, 3)
     pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
     return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)
@@ -139,10 +139,10 @@ def _apart(one, other, side):
 
 @njit
 def _pairs(starts, ends, boxes, group, width, height):
-    """Which lanes follow which, and which pairs may cross each other; both bool [lanes, lanes].
+    """Whether lane j begins where lane i ends, and whether i and j may cross; both bool [lanes i, lanes j].
 
-    Args: start and end poses float64 [lanes, 3]; middle and half sides (m) of boxes, float64 [lanes, 4]; the group of
-    each lane.
+    Args: start and end poses float64 [lanes, 3]; middle and half sides (m) of boxes, float64 [lanes, 4]; `group`
+    [lanes], the same for lanes side by side.
     """
     n = len(starts)
     follows, candidates = np.zeros((n, n), dtype=np.bool_), np.zeros((n, n), dtype=np.bool_)
@@ -176,7 +176,7 @@ def _near(one, other, width, height):
 
 @njit
 def _crossings(points, offsets, candidates, width, height):
-    """Which of the candidates, pairs of lanes, may collide in a junction: bool [lanes, lanes], symmetric."""
+    """Which candidate pairs of lanes come within CROSSING_GAP of each other: bool [lanes, lanes], symmetric."""
     cross = np.zeros_like(candidates)
     for i in range(len(cross)):
         one = points[offsets[i] : offsets[i + 1]]

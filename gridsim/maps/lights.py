@@ -1,8 +1,8 @@
-"""Traffic lights: programs that repeat, and the stop lines that they close. A network without lines has none.
+"""Traffic lights: programs that repeat, and the stop lines that they close. A network without stop lines has no lights.
 
 While its light is not green, a stop line is a wall for the sensors of cars that drive towards it; while the light is
 red, they must not cross it. It reaches across the road, so that nobody passes beside it. All lights of a map share one
-clock, `state.CLOCK`, whose beginning follows from an episode's start: the same start has the same lights, whoever
+clock, `state.CLOCK`. Its first value follows from an episode's start: the same start has the same lights, whoever
 drives.
 """
 
@@ -20,14 +20,14 @@ from gridsim.maps.network import Network, wrapped, wrapped_any
 from gridsim.state import CLOCK, COS, POSE, SIN, X, Y
 
 GO, CLEARING, STOP = 0, 1, 2  # green; yellow: those who cannot stop any more may go; red
-NO_LINE = F(1e9)  # m, the way to a stop line where there is none
+NO_LINE = F(1e9)  # m, stands for the way to a stop line if there is none
 
 
 def lights_of(signals: ArrayLike, lines: ArrayLike, programs: Sequence[Sequence[int]]) -> dict[str, Any]:
     """The fields of a Network that hold its lights.
 
-    Args: `signals` [lanes], the number of the program by which cars enter a lane, or -1; `lines` [lines, 5]; what each
-    of the `programs` shows in each second, of which the first are those of the lines.
+    Args: `signals` [lanes] and `lines` [lines, 5] as in `Network`; `programs`, what each program shows in each second.
+    Program k is that of line k; programs that only `signals` name come after those of the lines.
     """
     return {
         "lines": freeze(np.array(lines, dtype=np.float32).reshape(-1, 5)),
@@ -38,7 +38,7 @@ def lights_of(signals: ArrayLike, lines: ArrayLike, programs: Sequence[Sequence[
 
 
 def no_lights(lanes: int) -> dict[str, Any]:
-    """The fields of a Network with this number of lanes that hold its lights: none."""
+    """`lights_of` for a network of `lanes` lanes without lights."""
     return lights_of(np.full(lanes, -1), [], [])
 
 
@@ -49,7 +49,7 @@ def programs_of_lines(network: Network) -> list[np.ndarray]:
 
 @leaf
 def light(network, program, seconds):
-    """What a program shows at a time: GO, CLEARING or STOP."""
+    """What a program shows at `seconds` on the lights' clock: GO, CLEARING or STOP."""
     program = U(program)
     first = network.program_offsets[program]
     cycle = network.program_offsets[program + U(1)] - first
@@ -58,7 +58,7 @@ def light(network, program, seconds):
 
 @leaf
 def set_clock(network, start, car):
-    """Set the lights' clock for a car at `start`: to the one that the start has, or to one drawn from its place."""
+    """Set a car's clock of the lights: to that of `start` if it continues a drive, else to a hash of its place."""
     if network.lines.shape[0] > 0:
         goes_on = start.shape[0] > POSE + 2 and start[POSE + 2] > ZERO
         drawn = mix(mix(U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))))
@@ -67,7 +67,7 @@ def set_clock(network, start, car):
 
 @leaf
 def way_to_line(network, seconds, least, x, y, cosine, sine):
-    """Way (m) straight ahead to the first stop line whose light shows `least` or more; NO_LINE if there is none."""
+    """Way (m) straight ahead to the first stop line whose light shows `least` or STOP; NO_LINE if there is none."""
     best = NO_LINE
     for k in range(network.lines.shape[0]):
         line = network.lines[k]
@@ -85,7 +85,7 @@ def way_to_line(network, seconds, least, x, y, cosine, sine):
 def crosses_line(network, seconds, car, front, x, y, cosine, sine):
     """Whether a car's front, `front` m ahead of its middle, crosses the stop line of a red light.
 
-    The car goes from the pose of its state to the given one near by, which need not be wrapped over the torus.
+    The car moves from the pose in its state to the given pose near by, whose x, y may be outside the torus's sides.
     """
     from_x, from_y = car[X] + front * car[COS], car[Y] + front * car[SIN]
     to_x, to_y = x + front * cosine, y + front * sine

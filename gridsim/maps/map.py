@@ -17,7 +17,7 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, THICK_WALL, Road, St
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """One map; equal to itself alone."""
+    """One map. Maps are compared by identity."""
 
     name: str  # the scenario's name, or the file's path
     seed: int  # from which it was built
@@ -25,10 +25,10 @@ class Map:
     strips: Strips  # the exact drivable area, for pictures and tests
     network: Network  # its lanes
     torus: bool = True  # whether leaving on one side means entering on the other
-    # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
+    # float32 [n, 5], of a map without lanes (from a picture): where episodes begin, see `starts_at`; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
-    # bool [n], of a map from a file: whether episodes begin on each step between the network's points, or without lanes
-    # at each of `starts`; empty: everywhere.
+    # bool [n], of a map from a single file: whether episodes of the seed's part (`maps.parts`) begin on each step
+    # between the network's points; without lanes, which of the file's starts are in `starts`. Empty: everywhere.
     begins: np.ndarray = field(default_factory=lambda: freeze(np.zeros(0, dtype=bool)))
 
     @property
@@ -45,7 +45,7 @@ class Map:
         """Cumulative length (m) at each point of the network, with all lanes laid end to end: float64 [points]."""
         step = np.diff(self.network.points.astype(np.float64), axis=0)
         length = np.hypot(step[:, 0], step[:, 1])
-        length[self.network.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
+        length[self.network.offsets[1:-1] - 1] = 0.0  # a step from one lane to the next is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
     @cached_property
@@ -56,7 +56,7 @@ class Map:
         return freeze(np.concatenate([[0.0], np.cumsum(np.diff(self.mileage) * self.begins)]))
 
     def magnified(self) -> Map:
-        """The map with a metre for each unit (`SimConfig.unit`), for pictures: they look alike for cars of any size."""
+        """The map enlarged so that its unit (`SimConfig.unit`) is 1 m: pictures look alike for cars of any size."""
         if self.road.unit == 1.0:
             return self
         road, per_m = self.road, float(self.road.per_m)
@@ -83,7 +83,7 @@ class Map:
 
 
 def _frozen(part: Any) -> Any:
-    """A part of a map with its arrays read-only, as views."""
+    """A part of a map with read-only views of its arrays."""
     if isinstance(part, tuple):
         return type(part)(*map(_frozen, part))
     return freeze(part) if isinstance(part, np.ndarray) else part
@@ -97,7 +97,7 @@ def without_lanes(
     starts: np.ndarray,
     unit: float = 1.0,
 ) -> Map:
-    """A map that is all one clearance field [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
+    """A map without lanes: a clearance field [rows, columns], not a torus, on which episodes begin at starts [n, 5]."""
     road = make_road(nodes, speed_interval, thinnest, unit)
     network = lay_lanes([], float(road.width), float(road.height))
     return Map(name, 0, road, Strips.of(), network, torus=False, starts=freeze(starts))
@@ -122,10 +122,11 @@ def _starts_at(points, mileage, shares, starts):
 
 
 def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5], at rest, at shares float64 [n] in [0, 1) of the length of lanes on which episodes begin.
+    """Starts float32 [n, 5], at rest, at `shares` of the way over all lanes on which episodes begin.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
     without lanes, shares index `Map.starts`.
+    Args: `shares`, float64 [n] in [0, 1), of the length of these lanes laid end to end.
     """
     if not len(road_map.network.steps):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]

@@ -13,8 +13,8 @@ from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
-# To which cars of a crossing lane one gives way: none; those that move (where four roads give way to one another in a
-# circle); all, also those that stand.
+# Which cars of a crossing lane have priority: NEVER none; MOVING those that move, where roads give way to one another
+# in a circle; ALWAYS all, also those that stand.
 NEVER, MOVING, ALWAYS = YIELDS = 0, 1, 2
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
@@ -29,23 +29,23 @@ class Network(NamedTuple):
     speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
     offsets: np.ndarray  # int32 [lanes + 1], where each lane's points begin
     steps: np.ndarray  # float32 [lanes], m between a lane's points; 1 m at most
-    # int32 [lanes, k], padded with -1, at least one: lanes that start at its end point, modulo the torus's sides
+    # int32 [lanes, k], padded with -1: the lanes, at least one, that begin where a lane ends, modulo the torus's sides
     successors: np.ndarray
-    left: np.ndarray  # int32 [lanes], lane to which a car may change, or -1; its point i is beside point i
+    left: np.ndarray  # int32 [lanes], lane to the left to which a car may change, or -1; points i of both are abreast
     right: np.ndarray  # the same for the lane to the right
     crossing_offsets: np.ndarray  # int32 [lanes + 1], where each lane's part of `crossings` begins
     # int32 [c], for each lane the lanes with which it conflicts in a junction: they cross it or merge into its end.
-    # Lanes with the same beginning, predecessors, successors and neighbours are not among them; but on real roads, all
-    # of these except neighbours are, if they come close once more (`real.shape.Conflicts`).
+    # Neighbours are never among them. Predecessors, successors and lanes with the same beginning are among them only on
+    # real roads, if they come close to the lane once more (`real.shape.Conflicts`).
     crossings: np.ndarray
-    clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
-    yields: np.ndarray  # uint8 [c], whether cars on this lane give way to those of that one: `YIELDS`; [0]: none does
-    room: np.ndarray  # float32 [n], m that a car can move to its side of the road for oncoming cars
+    clear: np.ndarray  # float32 [c], m along each crossing lane that a car's rear must pass before this lane is free
+    yields: np.ndarray  # uint8 [c], which cars of each crossing lane have priority over this lane: `YIELDS`; [0]: none
+    room: np.ndarray  # float32 [n], m that a car at each point can move to its side of the road for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
-    # Traffic lights: float32 [lines, 5], the stop lines: middle x, y (m), direction of traffic (cosine, sine), and half
-    # the length (m) across that direction. Programs 0 to lines - 1 are theirs.
+    # float32 [lines, 5], the stop lines of traffic lights: middle x, y (m), direction of traffic (cosine, sine), and
+    # half the length (m) across that direction. Program k is that of stop line k.
     lines: np.ndarray
-    signals: np.ndarray  # int32 [lanes], the program by which cars enter each lane, or -1
+    signals: np.ndarray  # int32 [lanes], the program of the light at which cars enter each lane, or -1
     program_offsets: np.ndarray  # int32 [programs + 1], where each program's part of `programs` begins
     programs: np.ndarray  # uint8 [s], `lights.GO`, CLEARING or STOP in each second of a program, which repeats
     width: np.float32  # m, of the torus
@@ -53,7 +53,7 @@ class Network(NamedTuple):
     hand: np.float32  # the side of the road on which traffic drives: 1 right, -1 left
 
     def scaled(self, factor: float) -> Network:
-        """All lengths multiplied by a factor, a power of two; `speeds` are kept."""
+        """The network with lengths multiplied by a factor, a power of two; `speeds` and stop lines are kept."""
         if factor == 1.0:
             return self
         arrays = {
@@ -141,7 +141,7 @@ def _room_at_side(points, offsets, road, hand, length, width, verge, most, room)
 
 @njit
 def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, height, apart, clear):
-    """For each crossing, how far along the other lane (m) its last point within `apart` m of this lane is."""
+    """For each crossing, the way (m) along the crossing lane to its last point within `apart` m of this lane."""
     for lane in range(offsets.shape[0] - 1):
         for c in range(crossing_offsets[lane], crossing_offsets[lane + 1]):
             other = crossings[c]
@@ -160,9 +160,9 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
 
 
 def make_network(lanes: Network, road: Road, config: SimConfig, paces: np.ndarray | None = None) -> Network:
-    """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`.
+    """Lanes with `speeds`, `clear` and `room`, which traffic needs, computed for a road.
 
-    `paces` float32 [lanes]: traffic's speed (m/s) on straights; None: from the road's speed interval, on all lanes.
+    `paces` float32 [lanes]: traffic's speed (m/s) on straights; None: the same on all lanes, from the speed interval.
     """
     traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
@@ -183,7 +183,7 @@ def make_network(lanes: Network, road: Road, config: SimConfig, paces: np.ndarra
 
 
 def junctions(network: Network) -> int:
-    """How many junctions there are: sets of lanes that conflict with one another."""
+    """The number of junctions: sets of lanes that conflict, directly or through others of the set."""
     lanes = np.repeat(np.arange(len(network.steps)), np.diff(network.crossing_offsets))
     pairs = np.ones(len(lanes), dtype=np.bool_), (lanes, network.crossings)
     count, label = connected_components(coo_matrix(pairs, shape=(len(network.steps),) * 2), directed=False)
@@ -234,12 +234,12 @@ def successor(network, lane, number):
 
 @leaf
 def to_side(network, shift):
-    """Convert a shift (m) to the left to one away from traffic's side of the road, or back: -shift if that is left."""
+    """A shift (m) to the left as one away from traffic's side of the road, or back: -shift in left-hand traffic."""
     return shift if network.hand > ZERO else -shift
 
 
 @leaf
 def is_junction(network, lane):
-    """Whether a lane is inside a junction, that is, whether other lanes cross it."""
+    """Whether a lane is inside a junction, that is, whether other lanes conflict with it."""
     lane = U(lane)
     return network.crossing_offsets[lane + U(1)] > network.crossing_offsets[lane]

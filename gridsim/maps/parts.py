@@ -1,8 +1,8 @@
-"""Which maps are for training, for the choice of the champion, and for the final report and nothing else.
+"""Which maps are for training, which for the choice of the champion, and which only for the final report.
 
-Maps are asked for by seeds, which are in three parts. A generated road has a new map for each seed; the files of a
-folder are divided among the parts; and on a single file, episodes of each part begin in regions of their own. Where a
-scenario's name lists several roads, these take turns: in each part, the k-th seed of n roads is one of road k modulo n.
+Each map has a seed, and seeds are in three parts. A generated road has a new map for each seed; the files of a folder
+are divided among the parts; and on a single file, episodes of each part begin in regions of their own. If a scenario's
+name lists n roads, these take turns: in each part, the k-th seed (from 0) is for road k modulo n.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from gridsim.config import names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 
-TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_000_000  # of each part
+TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_000_000  # the first seed of each part
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
 YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
-# A square of a file: its path, middle and side.
+# A square of a file: PATH@X,Y,METRES or PATH@LAT,LON,METRES (its middle and side), perhaps with @left or @right.
 CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)(?:@left|@right)?")
-_TURNS = 0, 1, 2, 0, 0  # parts (`part_of`): files get them in turn, and so do regions along a row
+_TURNS = 0, 1, 2, 0, 0  # parts (`part_of`) in the order in which files get them, and regions along a row
 _REGIONS = 10  # along the longer side of a map
 
 
 def roads_of(name: str) -> list[str]:
-    """The roads that a scenario's name lists, separated by commas. A CROP has commas, too, and a file's name may."""
+    """The roads that a scenario's name lists, separated by commas. A CROP has commas, too, as may a file's name."""
     words, roads = [name] if os.path.exists(name) else name.split(","), list[str]()
     while words:
         n = 3 if CROP.fullmatch(",".join(words[:3])) else 1
@@ -46,18 +46,18 @@ def road_number(seed: int, roads: int) -> int:
 
 
 def seed_on(number: int, roads: int, own: int) -> int:
-    """The scenario's seed for the map that road `number`, of `roads`, has for its `own` seed."""
+    """The seed of a scenario of `roads` roads for the map that its road `number` alone has for seed `own`."""
     first = FIRST_SEEDS[part_of(own)]
     return first + (own - first) * roads + number
 
 
 def seeds_on(own: range, roads: int) -> range:
-    """The scenario's seeds for the maps that each of `roads` roads has for a range of its own seeds."""
+    """The seeds of a scenario of `roads` roads for the maps that each road alone has for the seeds `own`."""
     return range(seed_on(0, roads, own.start), seed_on(0, roads, own.stop))
 
 
 def road_of(name: str, seed: int) -> tuple[str, int]:
-    """The road of a scenario that a seed is for, and that road's own seed."""
+    """The road that a scenario's seed is for, and the seed for which this road alone has the same map."""
     roads, first = roads_of(name), FIRST_SEEDS[part_of(seed)]
     return roads[road_number(seed, len(roads))], first + (seed - first) // len(roads)
 
@@ -110,7 +110,7 @@ def seed_of_map(name: str, seed: int) -> int:
 
 
 def seeds_of_files(name: str) -> list[int]:
-    """The seeds of all maps of a path."""
+    """The smallest seed of each map of a path; of a single file, the first seed of each part."""
     return [first + k for first, files in zip(FIRST_SEEDS, divided(name), strict=True) for k in range(len(files))]
 
 
@@ -122,7 +122,7 @@ def file_of(name: str, seed: int) -> str:
 
 @lru_cache(maxsize=16)
 def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
-    """The map of a file with a seed; episodes begin in the regions of the seed's part, if the file is alone.
+    """The map of a file for a seed; if the file is not one of several, episodes begin in regions of the seed's part.
 
     On a map so small that a part would have no region, they begin anywhere, for all parts.
     """
@@ -136,7 +136,10 @@ def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
 
 
 def _regions(road_map: Map) -> np.ndarray | None:
-    """The part that each step of a lane, or without lanes each start, belongs to: int [n]; None if a part has none."""
+    """The part of each step between the network's points, or of each start if there are no lanes: int [n].
+
+    None if a part has none of them.
+    """
     places = road_map.starts[:, :2]
     if len(road_map.network.steps):
         points = road_map.network.points
@@ -148,7 +151,7 @@ def _regions(road_map: Map) -> np.ndarray | None:
 
 
 def held_out_place(name: str, held_out: Map) -> str:
-    """Where the drives of the final report are, in words, given one of its maps."""
+    """Words for where the drives of the final report take place; `held_out` is one of their maps."""
     if (roads := len(roads_of(name))) > 1:
         return f"held-out drives of {roads} roads"
     if not is_map_file(name):

@@ -23,30 +23,30 @@ from gridsim.maps.closing import (
 )  # fmt: skip
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR
 
-OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
-_FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
-HALF_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
-_TIP = 0.25  # m that a corner may extend beyond a disc of radius HALF_WALL without being a thin wall
-_HALO = DEEPEST + 2.0  # m around a tile that can influence it
-_TILE = 128  # nodes
+OUTSIDE = -FIELD_FLOOR  # units of wall around the road, at least, because the field wraps round at its sides
+_FINE = 0.25  # units, largest pixels on which distances are measured; larger ones are subdivided
+HALF_WALL = 0.4  # units, half the thickness that thin walls are given; above 0.36, a disc always covers a node
+_TIP = 0.25  # units that a corner may extend beyond a disc of radius HALF_WALL without being a thin wall
+_HALO = DEEPEST + 2.0  # units around a tile within which pixels can influence it
+_TILE = 128  # nodes along a side of the tiles in which the field is computed
 
-_TOUCH = 0.05  # m free around a car at a start given in the file
-_SMOOTH = 3.0  # m, standard deviation of the window over which a road's direction is averaged
-_COHERENCE = 0.5  # least agreement of directions there, from 0 (an open place, a crossing) to 1 (a straight road)
+_TOUCH = 0.05  # units free around a car at a start given in the file
+_SMOOTH = 3.0  # units, standard deviation of the Gaussian over which a road's direction is averaged
+_COHERENCE = 0.5  # least agreement of directions at a start, from 0 (an open place, a crossing) to 1 (a straight road)
 _STARTS = 512
-_APART = 24  # nodes of wall around a window, so that averages on one side do not see the road on the other
+_APART = 24  # nodes of wall around a window, which wraps: averages near one side must not see road near the other
 _BACK = np.array([0.0, 0.0, math.pi])
 
 
 def _depth(inside: np.ndarray, pixel: float) -> np.ndarray:
-    """Distance (m) of a region's pixels to its edge, which is half a pixel before the nearest pixel outside."""
+    """Distance (units) of a region's pixels to its edge, which is half a pixel before the nearest pixel outside."""
     return np.maximum(ndimage.distance_transform_edt(inside) - 0.5, 0.0) * pixel
 
 
 def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
-    """Distance (m) of pixels' centres to the edge between road and wall, positive on the road.
+    """Distance (units) of pixels' centres to the edge between road and wall, positive on the road.
 
-    Thin walls are thickened before, so that the nodes of the field do not miss them. A wall is thin where no disc of
+    Thin walls are thickened first, so that the nodes of the field do not miss them. A wall is thin where no disc of
     radius HALF_WALL fits into it; such a disc is put on each point of its middle line.
     """
     depth = _depth(~free, pixel)
@@ -61,9 +61,10 @@ def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
 
 
 def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int) -> np.ndarray:
-    """Signed clearance (m) float32 [rows, columns] at the nodes of the field, of road bool [pixels y, pixels x].
+    """Signed clearance (units) at the nodes of the field: float32 [rows, columns].
 
     Exact to a fifth of a pixel, up to the largest clearance of the field. It works tile by tile, to bound the memory.
+    Args: `free`, bool [pixels y, pixels x], which pixels are road; `resolution`, units a pixel.
     """
     halo = math.ceil(_HALO / resolution) + 1
     cut = max(math.ceil(resolution / _FINE - 1e-9), 1)
@@ -95,7 +96,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
 
 
 def _clearance_around(nodes: np.ndarray, poses: np.ndarray, along: np.ndarray, left: np.ndarray | float) -> np.ndarray:
-    """Clearance (m) at points of a car's frame (m) at each of poses [n, 3]: [n, points], bilinear, as in kernels."""
+    """Clearance [n, points] at points `along` and to the `left` of each of poses [n, 3]; bilinear, as in kernels."""
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
     c, s = np.cos(heading), np.sin(heading)
     at = [(y + along * s + left * c) * CELLS_PER_UNIT, (x + along * c - left * s) * CELLS_PER_UNIT]
@@ -103,7 +104,7 @@ def _clearance_around(nodes: np.ndarray, poses: np.ndarray, along: np.ndarray, l
 
 
 def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: float) -> np.ndarray:
-    """Whether a car with a margin (m) around it is entirely on the road at poses [n, 3]: bool [n]."""
+    """Whether a car with a margin (units) around it is entirely on the road at poses [n, 3]: bool [n]."""
     half = np.array([vehicle.length, vehicle.width]) / 2 + margin
     along, left = (np.linspace(-h, h, math.ceil(2 * h / NODE) + 1) for h in half)
     u, v = (points.ravel() for points in np.meshgrid(along, left))
@@ -127,7 +128,7 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _window(nodes: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """The index of the part of a field that has road, with wall around it, as a torus; and its corner: x, y (m).
+    """The part of a field that has road, with wall around it: its index into the field, and its corner x, y (units).
 
     A track may be small in a large picture. A side is kept whole where cutting it would not make it shorter.
     """
@@ -141,7 +142,7 @@ def _window(nodes: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 
 
 def road_length(nodes: np.ndarray) -> float:
-    """Estimated length (m) of the largest connected road: area over width. Within 10 % for a ring."""
+    """Estimated length (units) of the largest connected road: area over width. Within 10 % for a ring."""
     nodes = nodes[_window(nodes)[0]]
     road = nodes > 0.0
     labels, _ = ndimage.label(road)
@@ -158,7 +159,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 
 
 def has_room(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Where a field has room for a car to its sides, in parts with an extent of 30 m or more: bool [rows, columns]."""
+    """Where a car has room on both sides, in connected parts with an extent of FAR or more: bool [rows, columns]."""
     parts, _ = ndimage.label(nodes >= needed(vehicle))
     extent = [math.hypot(*(side.stop - side.start for side in box)) * NODE for box in ndimage.find_objects(parts)]
     return (np.array([0.0, *extent]) >= FAR)[parts]
@@ -167,7 +168,7 @@ def has_room(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
 def find_starts(
     nodes: np.ndarray, vehicle: VehicleConfig, unit: float, surrounded: bool
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where to drive on a picture's road, of which parts are closed (see `closing`), and where to begin.
+    """Close parts of a picture's road (see `closing`), and find starts on what stays open.
 
     Args: the field, a car in units of `unit` m, and whether the road has surroundings that are drawn like road.
     Returns: the field with walls where it is closed; start poses float64 [n, 3] (x, y, heading) along the road, both
@@ -205,7 +206,7 @@ def find_starts(
 
 
 def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> None:
-    """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
+    """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would not be entirely on the road."""
     inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * NODE)).all(axis=1)
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):

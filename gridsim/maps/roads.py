@@ -22,20 +22,22 @@ CELLS_PER_UNIT = 2  # nodes of the clearance field per unit
 FIELD_FLOOR = -2.0  # clearance of byte 0, also of places deeper inside a wall
 FIELD_STEPS = 32.0  # steps of the byte per unit; byte 255 is 5.97
 VISIT_CELL = 4  # side of the cells in which new ground is counted
-THICK_WALL = 3.0  # among walls of this thickness or more, rays need no checks
+THICK_WALL = 3.0  # if no wall of a road is thinner, rays and collisions need no checks for thin walls
 
 
 class Road(NamedTuple):
     """A map as kernels read it; all arrays flat, read-only and C-contiguous. Sides are powers of two."""
 
-    field: np.ndarray  # uint32 [rows * columns], bytes of the four corners: (0,0), (1,0), (0,1), (1,1) in (x, y)
+    # uint32 [rows * columns], for each cell the clearance at its corners (0,0), (1,0), (0,1), (1,1) in (x, y), a byte
+    # each, the lowest byte first
+    field: np.ndarray
     columns: np.uint32  # nodes along x
     rows: np.uint32  # nodes along y
     width: np.float32  # m along x
     height: np.float32  # m along y
     speed_low: np.float32  # m/s, the speed interval
     speed_high: np.float32  # m/s
-    thinnest: np.float32  # units; no ray passes a wall that is at least as thick as this
+    thinnest: np.float32  # units; rays hit every wall that is at least this thick
     unit: np.float32  # m, a power of two
     per_m: np.float32  # units in a metre
     ways: np.float32  # 2: driving back over the same ground counts as new distance; 1: it does not
@@ -187,7 +189,7 @@ def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
 def make_road(
     nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, unit: float = 1.0, ways: int = 1
 ) -> Road:
-    """The Road of a clearance field [rows, columns]; speeds m/s; thinnest, of its walls, in units as the field is."""
+    """The Road of a clearance field [rows, columns], in units of `unit` m as `thinnest` is; speeds in m/s."""
     rows, columns = nodes.shape
     return Road(
         field=pack_field(nodes),

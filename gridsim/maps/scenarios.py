@@ -64,7 +64,7 @@ def has_lanes(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Raises: GridSimError if one of the roads is neither in the registry nor a map file, or is named twice."""
+    """Raises: GridSimError if a road is neither in the registry nor a map file, or if two have the same label."""
     roads = roads_of(name)
     if not all(roads):
         raise GridSimError(f"scenario {name!r}: the name of a road is empty")
@@ -105,8 +105,8 @@ def map_digest(name: str) -> str:
 def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> int:
     """The number of other cars on a road, if a number, `usual`, `heavy` or None (the default) is asked for.
 
-    Unless it is a number, there are none on a map without lanes, or if cars are small. Raises: GridSimError for another
-    word.
+    Unless `asked` is a number, there are none on a map without lanes, or if cars are small (`SimConfig.unit` below 1).
+    Raises: GridSimError for another word.
     """
     if type(asked) is int:
         return asked
@@ -121,7 +121,7 @@ def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None
 
 
 def crowds(name: str, asked: Traffic | None = None, config: SimConfig | None = None) -> tuple[int, ...]:
-    """The number of other cars on each road of a scenario, as `traffic_on`; on several, the default is `usual`."""
+    """`traffic_on` for each road of a scenario; if it has several roads, the default (None) is `usual`."""
     roads = roads_of(name)
     asked = "usual" if asked is None and len(roads) > 1 else asked
     return tuple(traffic_on(road, asked, config) for road in roads)
@@ -145,8 +145,8 @@ def _interval_of_files(name: str, _digest: str, config: SimConfig) -> tuple[floa
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`), and there are
-    neither traffic nor lights.
+    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`), and the road
+    has no lights.
     """
     config = config or SimConfig()
     check_name(name)

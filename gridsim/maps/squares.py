@@ -44,7 +44,7 @@ def rotated(x: float, y: float, quarters: int) -> tuple[float, float]:
 def through_square(turn: int, half: float, offset: float) -> Pieces:
     """Pieces of a lane through a square of side 2 * half, `offset` m to the right of the road's middle.
 
-    turn: sides from the one it enters by to the one it leaves by, counter-clockwise: 1 right, 2 straight, 3 left.
+    turn: the number of sides, counter-clockwise, from the lane's entry to its exit: 1 right, 2 straight, 3 left.
     """
     if turn == 2:
         return ((2.0 * half, 0.0),)
@@ -66,7 +66,7 @@ class Layout:
         self.paths: list[Path] = []
         self.stop_lines: list[list[float]] = []
         self.programs: list[list[int]] = []  # what the light of each stop line shows in each second
-        self.signals: dict[int, int] = {}  # the number of the stop line by which cars enter a lane
+        self.signals: dict[int, int] = {}  # for a lane, the number of the stop line at which cars enter it
 
     def line(self, x: float, y: float, end_x: float, end_y: float) -> None:
         """Add a straight road between two points."""
@@ -102,10 +102,10 @@ class Layout:
             self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
 
     def signal(self, first: int, across: float, late: int) -> None:
-        """Put traffic lights in the middle of a straight street and split its lanes, paths `first` and the next, there.
+        """Put traffic lights in the middle of a straight street, and split its two lanes there.
 
-        Args: `across`, half of a stop line's length (m); `late`, seconds by which the lights' cycle begins after their
-        clock.
+        Args: `first`, the index of the first lane's path; the other lane's is the next one; `across`, half of a stop
+        line's length (m); `late`, the time (s) on the lights' clock at which a cycle of PHASES begins.
         """
         for k in (first, first + 1):
             (x, y, heading, ((length, _),)) = self.paths[k]

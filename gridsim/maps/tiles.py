@@ -2,7 +2,7 @@
 
 The edges of a node decide its tile: two opposite edges make a straight, two others a curve, three a T, four a crossing.
 No node has a single edge, so every lane has a successor. Each block of the network is surrounded by ten tiles or more:
-the way round it, corners cut, is longer than the 200 m within which the same ground does not count again.
+the way round it, corners cut, is longer than 200 m, the default of `episode.revisit`, so that each lap is new ground.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from gridsim.maps.squares import DIRECTIONS, components
 TILE = 32.0  # m, side of a tile
 TILES = 8  # along each side of the torus
 LANE_WIDTH = 3.5  # m
-SHOULDER = 0.5  # m of paved road outside the outer lane
+SHOULDER = 0.5  # m of paved road beyond each of the two lanes
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
-EDGE_SHARE = 0.9  # share of the graph's edges that are kept where SHORTEST_BLOCK allows
-SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
+EDGE_SHARE = 0.9  # share of the graph's edges that are opened, unless they would close too short a block
+SHORTEST_BLOCK = 10  # tiles around each block of the network, at least
 
 
 def _closes_short_block(edges: list[list[bool]], tile: int, direction: int) -> bool:
-    """Whether opening this edge of a tile would close a block of fewer than SHORTEST_BLOCK tiles.
+    """Whether opening this edge of a tile would close a block with fewer than SHORTEST_BLOCK tiles around it.
 
     The search is on the unrolled plane, since a way round the whole torus encloses no block.
     """
@@ -68,6 +68,7 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
         part = components(squares)
         largest = part == np.bincount(part).argmax()
         edges[~largest] = False
-        round_x, round_y = squares[..., 0].all(axis=1), squares[..., 1].all(axis=0)  # rows, columns of a straight road
+        # Whether each row, and each column, is one straight road round the torus.
+        round_x, round_y = squares[..., 0].all(axis=1), squares[..., 1].all(axis=0)
         if largest.sum() >= TILES * TILES // 2 and not (round_x.any() or round_y.any()):
             return edges

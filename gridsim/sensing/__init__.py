@@ -1,1 +1,1 @@
-"""What a car senses: range rays, the occupancy grid, a route; what sensors lack; an observation's features."""
+"""What a car senses: range rays, the occupancy grid, mirrors, a route; imperfections of sensors; observations."""

@@ -1,15 +1,16 @@
 """The occupancy grid: the ground ahead, cell by cell, computed from the range sensor's rays.
 
-80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side (for small cars these are units,
-`SimConfig.unit`). Row 0 is the farthest ahead and column 0 the leftmost, as in a picture that looks ahead. Each cell
-within the field of view belongs to the ray whose direction is nearest to its centre's. With r the centre's distance
-from the front axle, R the ray's range and h half the diagonal of a cell, the cell is
+80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side (for small cars, read units
+(`SimConfig.unit`) instead of m). Row 0 is the farthest ahead and column 0 the leftmost, as in a picture that looks
+ahead. Each cell within the field of view belongs to the ray whose direction is nearest to that of the cell's centre.
+With r the centre's distance from the middle of the front axle, R the ray's range and h half the diagonal of a cell,
+the cell is
 
 * free if r < R - h, before the ray's hit;
 * occupied if R - h <= r <= R + h, at the hit;
 * unknown if r > R + h, behind the hit, or if it is outside the field of view.
 
-A ray with its full range hit nothing: its cells are free up to there, and unknown beyond.
+A ray whose range is the sensor's full range hit nothing: its cells are free up to that range, and unknown beyond.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import F, U, freeze, leaf, njit
 
 CELLS = 80  # along each side
-CELL = 0.5  # units
+CELL = 0.5  # side of a cell, in units (`SimConfig.unit`)
 MAX_FRAMES = 8  # in an observation
 #: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
-HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # units
+HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # of a cell, in units
 
 
 class GridTable(NamedTuple):
     """Cells sorted by ray, then by distance; computed once for a configuration of the sensor."""
 
-    first: np.ndarray  # int32 [rays + 1]: where each ray's cells begin
+    first: np.ndarray  # int32 [rays + 1]: where each ray's part of `cells` begins; the last is its end
     cells: np.ndarray  # uint16 [cells in view]: index into a grid, row by row
     radii: np.ndarray  # float32 [cells in view + 1]: m, of the centres from the front axle; the last is infinite
     reach: np.float32  # m, the rays' full range

@@ -1,7 +1,7 @@
 """What real sensors and actuators do: noise, rays that read nothing, and readings and commands that come late.
 
-Noise depends only on where a car is and on its control step, so it is the same for any number of workers. Without
-imperfections the parameters are None, so that kernels are compiled without them.
+Noise depends only on where a car is and on its control step, so it is the same for any number of workers. For a
+perfect sensor, kernels get None instead of Imperfections, and Numba leaves their code out; likewise for Delays.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Imperfections(NamedTuple):
 
     noise: np.float32  # m, standard deviation
     noise_share: np.float32  # the same, as a share of the range
-    dropout: np.uint64  # how many of 2 ** 24 readings are the sensor's full range, whatever is there
+    dropout: np.uint64  # of 2 ** 24 readings, how many (on average) are the full range, whatever is there
 
 
 class Delays(NamedTuple):
@@ -35,7 +35,7 @@ class Delays(NamedTuple):
 
 
 class History(NamedTuple):
-    """Readings and commands of the latest control steps, which take effect late; rings, indexed by step."""
+    """The latest readings and commands of a car, which take effect late; ring buffers, indexed by control step."""
 
     readings: np.ndarray  # float32 [steps, 2, rays], ranges and closing speeds
     commands: np.ndarray  # float32 [steps, 2]
@@ -52,7 +52,7 @@ def imperfections_of(config: SimConfig) -> tuple[Imperfections | None, Delays | 
 
 @leaf
 def degrade(imperfections, reach, car, ranges):
-    """Add noise to ranges (m), which stay within [0, `reach`], and set some to `reach`: they are dropped."""
+    """Add noise to ranges (m), clip them to [0, `reach`], and set the readings that drop out to `reach`."""
     if imperfections is None:
         return
     place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre
@@ -96,7 +96,10 @@ def late_readings(history, car, ranges, closing):
 
 @leaf
 def late_command(history, car, first, second, neutral):
-    """The command, two numbers, of some steps ago; in the first steps neutral and 0. Keeps the latest one."""
+    """Store this step's command (`first`, `second`), and return the one of `Delays.commands` steps ago.
+
+    In the first steps, that is (`neutral`, 0).
+    """
     if history is None or history.commands.shape[0] == 0:
         return first, second
     slot = I(car[STEPS]) % I(history.commands.shape[0])

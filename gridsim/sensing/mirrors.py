@@ -8,15 +8,15 @@ from gridsim.state import COS, LANE, SIN, X, Y
 
 REACH = F(20.0)  # m behind, as far as mirrors show cars
 SAME_WAY = F(0.7)  # least cosine of the angle between the headings of cars that drive the same way
-ASIDE = F(5.5)  # m to either side, so that they show the next lane and not the one after it
+ASIDE = F(5.5)  # m to either side that mirrors show: the next lane, not the one after it
 
 
 @exact
 def read(simulation, car, world, ways):
     """Write to `ways` float32 [2] how far behind (m) the next car on the right and the next one on the left are.
 
-    It is 0 for a car alongside, and REACH if there is none. A car straight behind is in neither mirror, nor is one that
-    comes the other way or from the side.
+    The gap is bumper to bumper: 0 for a car alongside, and REACH if there is none. A car straight behind is in neither
+    mirror, nor is one that comes the other way or from the side.
     """
     road, constants = simulation.road, simulation.constants
     ways[0] = ways[1] = REACH

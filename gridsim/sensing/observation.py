@@ -1,7 +1,8 @@
-"""What a car sees: the features of an observation, encoded here alone.
+"""What a car sees: the features of an observation. Only this file encodes them.
 
-The environment returns them as shares of what the sensor and the car can do; policies, exported networks and the DQN
-turn these into the inputs of networks. A further feature is a row of `features`, and its place in `observe`.
+The environment returns features as shares of what the sensor and the car can do (`Feature.full`); policies, exported
+networks and the DQN turn these shares into the inputs of networks. To add a feature, add a row to `features` and a line
+to `observe`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from gridsim.sensing import mirrors, route
 from gridsim.sensing.route import AHEAD
 from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
-SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; a perceptron of a small car less (`SimConfig.pace`)
+SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; those on rays scale it by `SimConfig.pace`
 
 
 class Feature(NamedTuple):
@@ -27,13 +28,13 @@ class Feature(NamedTuple):
     name: str
     values: int  # how many numbers it has
     full: np.float32  # the value that the environment returns as 1
-    unit: np.float32  # the value that networks read as 1, before the shift
+    unit: np.float32  # the value that networks read as 1 before the shift, or if `near` as 0
     near: bool = False  # networks read a value v as 2 v / (v + unit) - 1, which resolves small values best
     least: np.float32 = -ONE  # the smallest number that the environment returns
-    shift: float = 0.0  # added to what networks read
+    shift: float = 0.0  # networks read value / unit + shift, unless `near`
     mirror: float = 1.0  # factor of the values in a mirrored world
     reversed: bool = True  # whether the values have the opposite order in a mirrored world
-    sees: str = ""  # for help: what a network sees that names this, as in `mlp:64+steering`; "": all networks see it
+    sees: str = ""  # what networks see, for help; only those that name it do (`mlp:64+steering`); "": all see it
 
 
 def features(k: Constants) -> tuple[Feature, ...]:
@@ -60,9 +61,9 @@ ROUTE, MIRRORS = ([feature.name for feature in FEATURES].index(name) for name in
 class Encoding(NamedTuple):
     """How an observation is encoded, as kernels read it; arrays [features]."""
 
-    first: np.ndarray  # int64 [features + 1], where each feature's values begin; one that is not seen has none
+    first: np.ndarray  # int64 [features + 1], index of each feature's first value, then the end; if unseen, it has none
     near: np.ndarray  # bool
-    full: np.ndarray  # float32, as the others
+    full: np.ndarray  # float32, as the arrays below
     least: np.ndarray
     scale: np.ndarray  # for networks: full / unit, or where `near` the unit
     shift: np.ndarray
@@ -74,7 +75,7 @@ class Encoding(NamedTuple):
 
 @lru_cache
 def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
-    """The encoding of an observation with the features of these names, and of those that all networks see."""
+    """The encoding of observations that have the features of these names and those that all networks see."""
     values = [each.values if each.name in names or not each.sees else 0 for each in features(k)]
     rows = [
         (each.near, each.full, each.least, each.unit if each.near else each.full / each.unit, each.shift)
@@ -85,7 +86,10 @@ def encoding(names: tuple[str, ...], k: Constants = USUAL) -> Encoding:
 
 
 def mirrored(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """An observation in a mirror: the index of each value's image, int64 [values], and its factor, float32 [values]."""
+    """How to mirror an observation: value k of the mirrored one is `factors[k] * observation[indices[k]]`.
+
+    Returns: indices int64 [values] and factors float32 [values].
+    """
     first = encoding(names).first
     order = [
         np.arange(*ends)[:: -1 if feature.reversed else 1]
@@ -96,13 +100,13 @@ def mirrored(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 @exact
 def sees(encoding, feature):
-    """Whether a feature, by its number, is seen."""
+    """Whether observations have a feature, given by its row in `features`."""
     return encoding.first[feature] < encoding.first[feature + 1]
 
 
 @exact
 def _put(encoding, feature, values, observation):
-    """Write the values of a feature, by its number, if it is seen."""
+    """If observations have this feature (a row of `features`), write its values as shares of `full`, at most 1."""
     first, full, least = U(encoding.first[feature]), encoding.full[feature], encoding.least[feature]
     for i in range(U(encoding.first[feature + 1]) - first):  # unsigned, or it would not be vector code
         observation[first + i] = min(max(values[i] / full, least), ONE)
@@ -130,7 +134,7 @@ def observe(simulation, car, world, ranges, closing, observation):
 
 @exact
 def normalise(encoding, observation, inputs):
-    """Write the inputs of a network on rays for an observation."""
+    """Write the inputs float32 [values] of a network on rays (not on grids), given its observation."""
     for feature in range(encoding.full.shape[0]):
         full, scale, shift = encoding.full[feature], encoding.scale[feature], encoding.shift[feature]
         first, last = U(encoding.first[feature]), U(encoding.first[feature + 1])

@@ -1,12 +1,12 @@
 """The range sensor: rays over the forward field of view, to the road's edge (`sense`), other cars (`cast_boxes`) and
 stop lines of lights (`cast_lines`).
 
-A ray is marched through the signed clearance field d to its root. It takes steps longer than the clearance while the
-road is wide, and Newton steps near the edge, with slopes of the bilinear field.
+A ray is marched through the signed clearance field d to its root. Far from the edge, its steps are 1.5 times the
+clearance; near the edge, they are Newton steps with the slope of the bilinearly interpolated field.
 
-A step longer than the clearance may skip a wall. On maps with walls thinner than such a step, steps are shorter, and
-checked: one from t0 to t1 is safe up to t0 + d(t0) and from t1 - |d(t1)| on. If a wall of the map may fit into the gap
-in between, the ray goes back.
+A step longer than the clearance may skip a wall. On maps with walls thinner than THICK_WALL, Newton steps are shorter,
+and each step is checked: of a step from t0 to t1, the ground is known up to t0 + d(t0) and from t1 - |d(t1)| on. If a
+wall of the map may fit into the part between these, the ray goes back.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _march, _march_among_thin_walls = vector_march(16, False), vector_march(24, True
 
 
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
-    """Directions of the rays from the heading: float32 [2, lanes] of cosine and sine.
+    """Cosine and sine of each ray's angle from the heading, `first + k * step` rad for ray k: float32 [2, lanes].
 
-    `lanes` is count rounded up to a multiple of SIMD_RAYS; the extra ones repeat the last ray.
+    `lanes` is count rounded up to a multiple of SIMD_RAYS; the extra columns repeat the last ray.
     """
     ray = np.minimum(np.arange(-(-count // SIMD_RAYS) * SIMD_RAYS), count - 1)
     angle = first + step * ray
@@ -38,7 +38,7 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
 
 @leaf
 def sense(road, fan, reach, x, y, cosine, sine, ranges):
-    """Ranges of all rays from a point, in m.
+    """Ranges (m) of all rays from a point to the road's edge.
 
     Args: fan of `fan()`, reach m, position m, heading as cosine and sine.
     Writes: ranges float32 [rays], in [0, reach].
@@ -61,12 +61,12 @@ def sense(road, fan, reach, x, y, cosine, sine, ranges):
 
 @leaf
 def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, world, ranges, closing):
-    """Shorten ranges (m) to the first box of a world that each ray hits: slab test (Kay and Kajiya 1986).
+    """Shorten ranges (m) to the first car of a world that each ray hits: slab test of boxes (Kay and Kajiya 1986).
 
     Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading, and velocity (m/s) along the
     heading and to the left; world as in `traffic.world`.
-    Writes: ranges float32 [rays] and, unless it is [0], closing float32 [rays]: the closing speed (m/s), along the ray,
-    of the sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
+    Writes: ranges float32 [rays] and, unless it is empty, closing float32 [rays]: how fast (m/s, along the ray) the
+    sensor and the car that the ray hits approach each other, as a radar measures it; 0 where a ray hits no car.
     """
     for r in range(closing.shape[0]):
         closing[r] = ZERO
@@ -93,7 +93,8 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
             continue
         first, last = I(0), last_ray
         if squared > F(4.0) * radius * radius:
-            # Only the rays that may hit the box's circle; here the arc sine is at most 1.05 times its argument.
+            # Test only rays that may hit the circle around the box, which spans asin(radius / distance) to either side.
+            # At this distance, the arc sine is at most 1.05 times its argument.
             half = F(1.06) * radius / math.sqrt(squared)
             angle = math.atan2(aside, forward)
             low, high = (angle - half - constants.ray_first), (angle + half - constants.ray_first)
@@ -122,7 +123,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
 def cast_lines(network, fan, reach, seconds, x, y, cosine, sine, ranges, closing):
     """Shorten ranges (m) to stop lines whose light is not green, for rays that cross them in the direction of traffic.
 
-    Args as in `cast_boxes`; `seconds` on the lights' clock. The closing speed of such a ray is 0.
+    Args as in `cast_boxes`; reach, m; `seconds`, the time on the lights' clock. Such a ray's closing speed is set to 0.
     """
     for k in range(network.lines.shape[0]):
         line = network.lines[k]

@@ -1,10 +1,11 @@
 """A route to follow: which way to go where a road forks, for drivers who have somewhere to go.
 
-A route is a walk over the lanes. Its state is a lane, the metres along it, and a key, from which SplitMix64 draws the
-lane after it and the next key. So a route has no end and takes three numbers of a car's state; what lies ahead is found
-by walking on. An episode's first key follows from its start: the same start has the same route, whoever drives.
+A route is a random walk over the lanes. A place on it is a lane, the metres along that lane, and a key, from which
+SplitMix64 draws the next lane and the next key. So a route has no end and takes three numbers of a car's state; what
+lies ahead is found by walking on. An episode's first key follows from its start: the same start has the same route,
+whoever drives.
 
-The car's place on its route is the point next to the car, found by moving on from the place of the step before.
+The car's place on its route is the route's point nearest to the car, found by moving on from the previous step's place.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import lane_length, successor, wrapped_any
 from gridsim.state import COS, POSE, ROUTE_ALONG, ROUTE_KEY, ROUTE_LANE, SIN, X, Y
 
-AHEAD = (F(5.0), F(10.0), F(20.0), F(40.0))  # units along the route to the points that are seen
-ASTRAY = F(6.0)  # units from the route beyond which an episode ends
-_OPPOSITE = F(1e8)  # m2, more than any squared distance on a map
+AHEAD = (F(5.0), F(10.0), F(20.0), F(40.0))  # points that a car sees, in units (`SimConfig.unit`) along its route
+ASTRAY = F(6.0)  # units (`SimConfig.unit`) from the route beyond which an episode ends
+_OPPOSITE = F(1e8)  # m2, added for lanes that lead the other way; more than any squared distance on a map
 _KEYS = U((1 << 24) - 1)  # float32 holds all whole numbers up to here
 
 
@@ -32,7 +33,7 @@ def check_lanes(road_map: Map, features: tuple[str, ...]) -> None:
 
 @exact
 def _following(network, lane, key):
-    """The lane after a lane of a route, and the key of what follows."""
+    """The lane that follows a lane on a route, and its key, which decides the lane after it."""
     bits = mix(key)
     return successor(network, lane, uniform(bits)), bits & _KEYS | U(1)
 
@@ -110,9 +111,10 @@ def begin_route(network, start, car):
 
 @njit(_nrt=False, fastmath=False)
 def follow_route(network, car, most):
-    """Move a car's place on its route to the point nearest to it, by `most` m at most, not back to an earlier lane.
+    """Move a car's place on its route to the route's point nearest to the car, but not back to an earlier lane.
 
-    Returns: by how much (m, negative backwards), and the car's squared distance from there (m2).
+    It moves by at most `most` m plus one step between a lane's points. Returns: how far it moved (m, negative
+    backwards), and the car's squared distance (m2) from the new place.
     """
     lane, before, key = _place(car)
     progress, way = ZERO, 0
@@ -137,9 +139,9 @@ def follow_route(network, car, most):
 
 @exact
 def read(simulation, car, values):
-    """Write to `values` float32 [8] where the points of AHEAD are: how far ahead of the car, then how far to the left.
+    """Write to `values` float32 [8] where the four points of AHEAD are, relative to the car and its heading.
 
-    Both are shares of the points' distances along the route.
+    First how far ahead each point is, then how far to the left, both as shares of its distance along the route.
     """
     network, place, metres = simulation.network, _place(car), ZERO
     for k in range(len(AHEAD)):
@@ -161,9 +163,9 @@ def _points_ahead(network, unit, cars, points):
 
 
 def points_ahead(road_map: Map, cars: np.ndarray) -> np.ndarray:
-    """Points of AHEAD (m, not wrapped over the torus) of cars in states [n, CAR_FIELDS], for pictures.
+    """Points at the distances AHEAD on the routes of cars in states [n, CAR_FIELDS], for pictures.
 
-    Returns: float32 [n, points, 2], where [n, 0, 2] means that they have no route.
+    Returns: float32 [n, points, 2], x, y (m, not wrapped over the torus); empty [n, 0, 2] if the cars have no route.
     """
     points = np.empty((len(cars), len(AHEAD) if cars[0, ROUTE_KEY] else 0, 2), dtype=np.float32)
     if points.size:

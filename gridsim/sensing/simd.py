@@ -18,24 +18,24 @@ from gridsim.jit import F
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 SIMD_RAYS = 32
-# In the field's units. Chosen for a small error (99th percentile over 4,000 poses: 0.06) with few steps of the slowest
-# ray.
+# Lengths in units (`SimConfig.unit`). Chosen for a small error (99th percentile over 4,000 poses: 0.06) and few steps
+# of the slowest ray.
 _NEAR = F(2.0)  # clearance below which Newton steps are taken
-_STRETCH = F(1.5)  # length of a step above _NEAR, in clearances
+_STRETCH = F(1.5)  # a stretched step, taken above _NEAR, is this times the clearance
 _CLOSE = F(0.04)  # clearance at which a ray has arrived
-_SLOPE_MIN = F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
-LEAP = F(2.0)  # added to a stretched step; still shorter than any wall of 3 or more
-MARGIN = F(0.1)  # for safety: what a ray leaves unseen among thin walls is shorter by this than they are thick
+_SLOPE_MIN = F(0.1)  # least slope of a Newton step, which is thus at most ten times the clearance
+LEAP = F(2.0)  # most by which a Newton step exceeds a stretched one: any step is then below clearance + THICK_WALL
+MARGIN = F(0.1)  # among thin walls, the leap is the thinnest wall's thickness less this, for safety
 
 
 def vector_march(steps: int, look_back: bool) -> Any:
     """Build the intrinsic that moves each of SIMD_RAYS rays to the edge of the road, in at most `steps` steps.
 
-    Its arguments: packed field with its sides; origin in cells; reach; the heading as cosine and sine; fan of
-    `rays.fan` and the index of the first ray to march; the leap; ranges float32 [rays], written from that ray on, in
-    [0, reach]; lengths in units. It runs until the last ray has arrived. With `look_back`, a ray goes back if the
-    part of a step that it did not see is longer than the leap; without, no code for that is emitted, and walls thinner
-    than 3 may be passed.
+    The intrinsic's arguments: `Road.field`, its columns and rows; origin, in the field's nodes; reach; the heading as
+    cosine and sine; fan of `rays.fan` and the index of the first ray to march; the leap (as LEAP); ranges float32
+    [rays], written from that ray on, in [0, reach]. Lengths are in units (`SimConfig.unit`). It runs until the last ray
+    has arrived. With `look_back`, a ray goes back if the part of a step that it did not see is longer than the leap.
+    Without, no code for that is emitted, and rays may pass walls thinner than THICK_WALL.
     """
 
     @intrinsic

@@ -1,4 +1,4 @@
-"""Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
+"""Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change to lanes beside theirs.
 
 Car following is the intelligent driver model (IDM; Treiber, Hennecke and Helbing 2000), and lane changes are MOBIL
 (Kesting, Treiber and Helbing 2007). The ego car is an obstacle like the other cars, but has the right of way at
@@ -46,7 +46,7 @@ class Drivers(NamedTuple):
 
 
 def drivers(sim: SimConfig) -> Drivers:
-    """The configuration for the kernels."""
+    """The parameters of traffic in a configuration, as kernels read them."""
     traffic = {name: np.float32(value) for name, value in vars(sim.traffic).items() if name in Drivers._fields}
     k, steps = constants(sim), F(lane_change_steps(sim))
     return Drivers(
@@ -88,14 +88,15 @@ def _ahead(network, car, other):
 
 @leaf
 def _swerve(drivers, speed, shift, sway, place, way):
-    """Move sideways from `shift` towards `place` (m, left of the lane) over `way` m: (shift, sway) after it.
+    """Move a car sideways from `shift` towards `place` (m to the left of its lane) while it drives `way` m.
 
-    The path bends no harder than SWERVE_RADIUS and the lateral acceleration of traffic in bends allow.
+    Returns: (shift, sway) after that; sway is m to the left per m driven. The path bends no harder than SWERVE_RADIUS
+    and the lateral acceleration of traffic in bends allow.
     """
     bend = min(ONE / config.SWERVE_RADIUS, drivers.lateral / max(speed * speed, ONE))
     steepest = min(config.STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, ONE))
     left = place - shift
-    # With this slope it would end up parallel to the lane, using half the bend.
+    # From this slope, a path with half the greatest curvature is parallel to the lane when it reaches `place`.
     wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
     after = min(max(wanted, sway - bend * way), sway + bend * way)
     moved = HALF * (sway + after) * way
@@ -106,11 +107,11 @@ def _swerve(drivers, speed, shift, sway, place, way):
 
 @leaf
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
-    """Distance (m) along a car's path to where another car, at (x, y), blocks it; 1e9 if it does not.
+    """Distance (m) from a car's middle along its path to where another car, at (x, y), blocks it; 1e9 if it does not.
 
     Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's SHIFT to `furthest`
-    m towards its side of the road, or as far as `Network.room` allows. That is 0 on roads with several lanes: there the
-    path returns to its lane.
+    m towards its side of the road, but at most to what `Network.room` allows. `room` is 0 on roads with several lanes:
+    there the path returns to its lane.
     """
     shift, sway = car[s.SHIFT], car[s.SWAY]
     aside_by = furthest > ZERO or shift != ZERO
@@ -191,7 +192,7 @@ def update_gap(network, drivers, car, other, is_ego):
 
 @leaf
 def _find_gaps(network, drivers, world, ego):
-    """Find the nearest obstacle within each car's horizon: its GAP and LEAD_SPEED."""
+    """Set each car's HORIZON, and find the nearest obstacle within it: GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, s.SPEED]
@@ -242,9 +243,10 @@ def change_lanes(network, drivers, world, i, ego):
 
 @leaf
 def _way_ahead(network, car, lane, along, there, place):
-    """Distance (m) forwards from `along` m on `lane` to `place` m on lane `there`; 1e9 above LANE_CHANGE_SIGHT.
+    """Distance (m) forwards from `along` m on `lane` to `place` m on lane `there`; 1e9 if it is too far.
 
-    The way is the car's own as far as it is known, then along first successors.
+    The way follows the car's own lanes where they are known (`lane_after`), else each lane's first successor, and the
+    search ends after LANE_CHANGE_SIGHT.
     """
     begins = -along  # m ahead at which the lane begins
     while lane >= 0 and begins <= config.LANE_CHANGE_SIGHT:
@@ -277,7 +279,7 @@ def _lanes_apart(network, lane, along, target):
 
 @leaf
 def _skew(network, lane, along, target):
-    """How far (m) ahead of a place on a lane its neighbour's point with the same index lies; 0 if at most SKEW."""
+    """How far (m) the point of `target` at `along` m is ahead of the lane's with the same index; 0 if SKEW or less."""
     k = I(along / network.steps[lane])
     one, other = network.offsets[lane] + k, network.offsets[target] + k
     first = min(other, network.offsets[target + 1] - 2)
@@ -307,7 +309,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         skew = _skew(network, lane, car[s.ALONG], target)
         along = max(car[s.ALONG] / network.steps[lane] * network.steps[target] - skew, ZERO)
         apart = _lanes_apart(network, lane, car[s.ALONG], target)
-        # The gaps to the next cars ahead and behind in the target lane, and to the one behind in its own.
+        # Distance (m) and speed of the next cars ahead and behind in the target lane, and of the one behind in its own.
         front, front_speed, rear, rear_speed, rear_desired = F(1e9), ZERO, F(1e9), ZERO, ONE
         left_behind, left_speed, left_desired = F(1e9), ZERO, ONE
         free = True
@@ -409,15 +411,15 @@ def _move(network, drivers, car, ego):
         car[s.JUNCTION_BEHIND] = -ONE
     set_pose(network, car)
     if car[s.SHIFT] != shift and touches_ego(network, drivers, car, ego):
-        car[s.SHIFT], car[s.SWAY] = shift, ZERO  # beside the ego car it stays where it is
+        car[s.SHIFT], car[s.SWAY] = shift, ZERO  # do not move sideways into the ego car
         set_pose(network, car)
 
 
 @leaf
 def step_traffic(network, drivers, world, ego):
-    """One control period of a world's traffic. The ego car must not have moved yet.
+    """Move all cars of a world for one control period. Call it before the ego car moves.
 
-    Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read, and CLOCK if the
+    Args: world [cars, TRAFFIC_FIELDS], changed; ego, the ego car's state: X to STEERING are read, and CLOCK if the
     network has lights.
     """
     cars = world.shape[0]

@@ -48,7 +48,7 @@ def way_to_ego_collision(network, drivers, car, ego):
     """Distance (m) along a car's path to its predicted collision with the ego car; 1e9 if it should drive on.
 
     Both are predicted at constant speed: the car along its lanes, keeping to the right, the ego car on its current arc.
-    The car drives on if they do not touch within FORESIGHT, or if the ego car would hit its side or rear and it can no
+    The car drives on if they do not touch within FORESIGHT, or if the ego car would hit its rear half and it can no
     longer stop in time.
     Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
@@ -60,7 +60,7 @@ def way_to_ego_collision(network, drivers, car, ego):
     dx, dy = wrapped(x - car[s.X], network.width), wrapped(y - car[s.Y], network.height)
     t = ZERO
     while True:
-        # The earliest time at which they can touch.
+        # s until the two can touch at the earliest.
         hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[s.SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:

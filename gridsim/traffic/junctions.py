@@ -16,7 +16,7 @@ from gridsim.maps.network import ALWAYS, MOVING, is_junction, lane_length, wrapp
 
 @leaf
 def _blocked_by_waiting_car(network, drivers, lane, other):
-    """Whether a car that waits at the end of lane `other` blocks, with its rear, a lane with the same beginning."""
+    """Whether the rear of a car that waits at the end of lane `other` blocks `lane`, which begins at the same point."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - I((F(2.0) * drivers.half_length + drivers.jam) / step)
     q = max(q, network.offsets[other])
@@ -61,9 +61,9 @@ def _in_ego_path(network, lane, ego, way):
 
 @leaf
 def _must_yield(network, drivers, car, other, first, last, seconds):
-    """Whether a car has to give way to another that comes to a lane with priority over its next lane.
+    """Whether `car` has to give way to `other`, which is about to enter a lane with priority over the car's next lane.
 
-    `first` to `last` are the crossings of this next lane; `seconds` on the lights' clock.
+    Args: `first` to `last`, the range of the car's next lane in `Network.crossings`; `seconds`, the lights' clock.
     """
     onward, speed = I(other[s.NEXT]), other[s.SPEED]
     if not is_junction(network, onward):
@@ -97,8 +97,8 @@ def _has_no_room(drivers, world, car):
 def may_enter(network, drivers, world, i, ego, ego_way, seconds):
     """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond.
 
-    The ego car has the right of way on the ground ahead of it, up to `ego_way` m, where a red light stops it; `seconds`
-    on the lights' clock.
+    The ego car has the right of way on the ground ahead of it, but not beyond `ego_way` m, where a red light stops it.
+    `seconds` is the time on the lights' clock.
     """
     car = world[i]
     here, lane, beyond = I(car[s.LANE]), I(car[s.NEXT]), I(car[s.SECOND_NEXT])
@@ -116,7 +116,7 @@ def may_enter(network, drivers, world, i, ego, ego_way, seconds):
         goes_first = network.yields.shape[0] > 0 and _must_yield(network, drivers, car, world[j], first, last, seconds)
         if goes_first and not _has_no_room(drivers, world, world[j]):
             return False
-        behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # no obstacle, even if the way comes back here
+        behind = there == here and world[j, s.ALONG] < car[s.ALONG]  # no obstacle, even if the way crosses itself
         # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]

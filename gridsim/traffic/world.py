@@ -59,7 +59,7 @@ def point_at(network, car):
 
 @leaf
 def lane_after(car, lane):
-    """The lane after `lane` on a car's way, which is known for its next two lanes; else -1."""
+    """The lane that a car takes after `lane`, if that is its LANE or NEXT; else -1: its way is not known further."""
     if lane == I(car[s.LANE]):
         return I(car[s.NEXT])
     return I(car[s.SECOND_NEXT]) if lane == I(car[s.NEXT]) else I(-1)
@@ -80,9 +80,10 @@ def choose_lane(network, lane, car):
 
 @njit(nogil=True)
 def _spawn(network, mileage, first, start, key, gap, ego_gap, lane_change_steps, world):
-    """Spawn the cars of an empty world, `gap` m apart or more, and `ego_gap` m from the ego car.
+    """Spawn the cars of an empty world, at least `gap` m apart and `ego_gap` m from the ego car's `start`.
 
-    `mileage` [lanes + 1]: cumulative m of lanes on which they may begin; each lane's part begins at `first` [lanes] m.
+    A part of each lane is for spawning: it begins `first` [lanes] m along the lane. `mileage` float64 [lanes + 1] is
+    the cumulative length (m) of these parts.
     """
     draws = 0
     for i in range(world.shape[0]):

@@ -7,6 +7,6 @@ import sys
 
 
 def has_display() -> bool:
-    """Whether a window may be opened: always on systems other than Linux; there, by the variables that SDL reads."""
+    """Whether a window may be opened: on Linux, if a variable is set that tells SDL of a display; elsewhere always."""
     variables = ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY")  # a driver given by name, Wayland or X11
     return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in variables)

@@ -27,8 +27,8 @@ from gridsim.view.render import Renderer, Window, interpolate
 # The columns of a recorded drive: the time is since the episode's start, and a restart begins the next episode.
 _POSE = ("x_m", "y_m", "heading_rad", "speed_mps", "steering_rad")
 COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed", "sim")
-MAX_TRAFFIC = 1000  # other cars in a recorded drive that is read
-LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
+MAX_TRAFFIC = 1000  # other cars in a recorded drive that is read, at most
+LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: the most that is read in a pose, either sign
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
 _ENDLESS = 10_000_000  # control steps
@@ -60,7 +60,7 @@ def manual(config: SimConfig, traffic: int = 0) -> Simulator:
 
 
 def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> None:
-    """Begin an episode at start float32 [5], among its traffic."""
+    """Begin an episode at start float32 [5], in traffic that follows from the map's seed and the episode's number."""
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
     worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
     simulator.reset(road_map, start[None], worlds=worlds)
@@ -131,7 +131,7 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
     if reader.fieldnames not in (
         [*COLUMNS],
         [*COLUMNS[:-1]],
-    ):  # the shorter form is of earlier versions: the default car
+    ):  # without `sim`, as earlier versions wrote it: the default car
         raise ValueError(f"the first line must be {','.join(COLUMNS)}")
     poses: list[list[float]] = []
     actions: list[int] = []

@@ -39,7 +39,7 @@ def lane_marks(road_map: Map) -> np.ndarray:
     across = (road_map.shortest(points[other] - here) * left).sum(axis=1)
     centre = _within(here + 0.5 * across[:, None] * left, size)
     dashes = np.column_stack([centre, ahead, np.full(len(centre), DASH / 2), cosine < 0.0])
-    once = (cosine > 0.0) | (lane[k] < lane[other])  # opposite lanes are each other's neighbours
+    once = (cosine > 0.0) | (lane[k] < lane[other])  # opposite lanes are each other's neighbours: one dash for both
     return freeze(dashes[once & road[other] & (abs(cosine) > PARALLEL)].astype(np.float32))
 
 

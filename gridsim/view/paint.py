@@ -1,6 +1,7 @@
 """Painting into pictures: the ground from the clearance field, rounded boxes, the shapes of a car, and all colours.
 
-Coordinates are pixels; `render` computes them.
+Shapes are drawn in pixels, which `render` computes. Other lengths are in units (`SimConfig.unit`), because `render`
+magnifies the maps of small cars, so that a unit is a metre on them.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ RAY, PATH, ROUTE = (92, 225, 200), (233, 172, 86), (240, 120, 235)
 HUD = (20, 22, 28)
 SIGNALS = (64, 192, 87), (250, 190, 40), (240, 50, 50)  # of `lights.GO`, CLEARING and STOP
 
-SQUARE = 16.0  # m, side of the ground's squares
-EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width
-VERGE_WIDTH = 0.7  # m
-DIP = 1.0  # m from the edge beyond which dips of the clearance are removed
+SQUARE = 16.0  # units (`SimConfig.unit`), side of the ground's squares
+EDGE_AT, EDGE_HALF = 0.3, 0.08  # units from the road's edge to its white line, and half that line's width
+VERGE_WIDTH = 0.7  # units
+DIP = 1.0  # units from the road's edge beyond which dips of the clearance are removed
 
 _COLOURS = np.array([GROUND, GROUND_OTHER, VERGE, ASPHALT, EDGE_LINE], dtype=np.float32)
 SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, corner radius, red, green, blue, opacity
@@ -37,17 +38,18 @@ SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, co
 
 @njit(nogil=True)
 def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
-    """Ground and road.
+    """Draw the ground and the road.
 
-    Args: a `smoothed` road; whether it repeats beyond its sides (else wall); place of the first pixel's centre
-    and steps to the next pixel to the right and below, float64 [2] in m.
+    Args: `road`, after `smoothed`; `repeats`, whether the map repeats beyond its sides (else there is wall);
+    `origin`, the place of the first pixel's centre; `step_x` and `step_y`, the steps to the next pixel to the right and
+    below. The last three are float64 [2] in units (`SimConfig.unit`).
     Writes: image uint8 [h, w, 3].
     """
     zero, half, one = F(0.0), F(0.5), F(1.0)
     scale = F(pixels_per_m)
     line_at, line_half = F(EDGE_AT) * scale, F(EDGE_HALF) * scale
-    inner = F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge: further inside there is only asphalt
-    outer = -max(F(VERGE_WIDTH), one / scale)  # m from the edge: further outside there is only ground
+    inner = F(EDGE_AT + EDGE_HALF) + one / scale  # units from the edge: further inside there is only asphalt
+    outer = -max(F(VERGE_WIDTH), one / scale)  # units from the edge: further outside there is only ground
     for j in range(image.shape[0]):
         for i in range(image.shape[1]):
             x = F(origin[0] + i * step_x[0] + j * step_y[0])
@@ -116,7 +118,7 @@ def draw_shapes(shapes, image):
 def car_parts(
     length: float, width: float, front_axle: float, rear_axle: float, steering: float, colour: Sequence[int]
 ) -> np.ndarray:
-    """Shapes [k, 11] of a car at the origin heading along +x, in m."""
+    """Shapes [k, 11] of a car at the origin, heading along +x; lengths in units (`SimConfig.unit`), steering in rad."""
     a, b = length / 2, width / 2
     c, s = math.cos(steering), math.sin(steering)
     light = [min(255, v + (255 - v) // 4) for v in colour]

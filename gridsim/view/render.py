@@ -28,7 +28,7 @@ from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
-METRES = 52.0  # height of a picture. Lengths here are in units (`SimConfig.unit`): metres, except for small cars
+METRES = 52.0  # height of a picture, in units (`SimConfig.unit`), which are metres except for small cars
 CAR_AT = 0.74  # where the car is in a picture, as a share of the picture's height from the top
 
 
@@ -62,13 +62,13 @@ class Renderer:
     def pixel(self, points: np.ndarray) -> np.ndarray:
         """Pixels float64 [n, 2] (x right, y down) of points [n, 2] (units) in the last picture drawn.
 
-        On a torus, the copy of a point that is nearest to the view's centre.
+        On a torus, a point repeats; the pixel is that of its copy nearest to the car.
         """
         offset = self.road_map.shortest(np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre)
         return self._anchor + self._turn(offset) * self.pixels_per_m
 
     def _turn(self, vectors: np.ndarray) -> np.ndarray:
-        """World directions [n, 2] as directions in the picture (y down)."""
+        """Directions [n, 2] on the map as directions in the picture (y down)."""
         (ux, uy), (x, y) = self._up, vectors.T
         return np.stack([x * uy - y * ux, -(x * ux + y * uy)], axis=1)
 
@@ -93,7 +93,7 @@ class Renderer:
             ranges: ranges of the car's rays [rays], m.
             path: the car's past positions [n, 2], m.
             text: a line for the lower left, and one for the upper left.
-            route: points of its route [n, 2], m.
+            route: points of the car's route [n, 2], m.
         """
         width, height = self.size
         position, heading = np.asarray(car[[X, Y]], np.float64) * self._per_m, np.asarray(car[[COS, SIN]], np.float64)
@@ -135,9 +135,10 @@ class Renderer:
         opacity: float,
         least: float = 0.5,
     ) -> np.ndarray:
-        """Shapes [n, 11] at pixels `centre` [n, 2] with directions [n, 2] there; half lengths and half width in units.
+        """Shapes [n, 11] at pixels `centre` [n, 2], with directions [n, 2] in the picture.
 
-        Where half the width is below `least` pixels, it is drawn as `least`, and the shape fainter.
+        `length` and `across`, half the length and half the width, and `radius`, of the corners, are in units. If
+        `across` is below `least` pixels, the shape is drawn `least` pixels wide to each side, and fainter.
         """
         scale = self.pixels_per_m
         shapes = np.empty((len(centre), paint.SHAPE), dtype=np.float32)
@@ -174,7 +175,10 @@ class Renderer:
         return np.concatenate(shapes)
 
     def _placed(self, parts: np.ndarray, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
-        """Shapes [n * k, 11] in pixels of a car's parts [k, 11] (m) at positions [n, 2] with headings [n, 2]."""
+        """Shapes [v * k, 11] in pixels of a car's parts [k, 11] (units), for those v of n cars that are in view.
+
+        The cars are at positions [n, 2] (units) with headings [n, 2] (cosine, sine).
+        """
         scale = self.pixels_per_m
         at, along = self.pixel(positions), self._turn(headings)
         seen = self._near(at, 8.0 * scale)
@@ -192,7 +196,7 @@ class Renderer:
         at = self.pixel(path)
         step, middle = at[1:] - at[:-1], (at[1:] + at[:-1]) / 2
         length = np.hypot(*step.T)
-        far = 20.0 * self.pixels_per_m  # a longer step crosses the torus's edge
+        far = 20.0 * self.pixels_per_m  # a longer step of the path crosses the torus's edge
         seen = (length > 0.01) & (length < far) & self._near(middle, far)
         step, middle, length = step[seen], middle[seen], length[seen]
         half = length / 2 / self.pixels_per_m + 0.12
@@ -249,10 +253,10 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
 class Window:
     """A window on a display, with its keys. A process may have several."""
 
-    _open: ClassVar[dict[Any, Window]] = {}  # open windows by pygame's, which events refer to
+    _open: ClassVar[dict[Any, Window]] = {}  # open windows by their `pygame.Window`, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
-        """Open it. Raises: NoDisplayError, and GridSimError without pygame."""
+        """Open the window. Raises: NoDisplayError; GridSimError if pygame is not installed."""
         check_extra("view")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
@@ -280,7 +284,7 @@ class Window:
         self.closed = False
 
     def show(self, image: np.ndarray, fps: float) -> None:
-        """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps`."""
+        """Show a picture uint8 [h, w, 3], and wait, so that at most `fps` pictures are shown in a second."""
         height, width = image.shape[:2]
         picture = self._pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB")
         self._window.get_surface().blit(picture, (0, 0))
@@ -288,9 +292,10 @@ class Window:
         self._clock.tick(fps)
 
     def keys(self) -> tuple[set[str], set[str]]:
-        """Names of the keys pressed since the last call, and of those held now or pressed since.
+        """The keys pressed since the last call; and the same keys plus those of the arrows and space that are held now.
 
-        Names are pygame's: "up", "space", "q", "escape". Also closes the windows that a user has closed.
+        Both are sets of pygame's names: "up", "space", "q", "escape". They are empty if this window is closed. Also
+        closes each window that the user has asked to close.
         """
         pygame = self._pygame
         for event in pygame.event.get():  # pygame has one queue for all windows

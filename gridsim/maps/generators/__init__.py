@@ -1,1 +1,1 @@
-"""The scenarios: each file of this folder is one, named like it. Its `SCENARIO` lays out maps."""
+"""The generated roads: each file of this folder is a scenario of the same name, described by its `SCENARIO`."""

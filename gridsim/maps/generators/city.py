@@ -20,12 +20,12 @@ SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
 HALF_ROAD = (3.4, 3.6)  # m, centre line to the kerb, drawn for each map
 CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, drawn for each crossing
-# For each axis, the number of streets and the least distance between them (m). The way round the smallest block,
-# corners cut, is longer than the 200 m within which the same ground does not count again.
+# Each map draws one of these: for x and for y, the number of streets and the least distance between them (m). The way
+# round the smallest block, corners cut, is longer than 200 m, the default of `episode.revisit`: each lap is new ground.
 GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
-BAY_SHARE = 0.6  # share of street sides with a bay
+BAY_SHARE = 0.6  # share of street sides with a bay, of those that are long enough
 BAY_DEPTH = 2.0  # m
-BAY_LENGTH = 12.0  # m, at least, without its ends
+BAY_LENGTH = 12.0  # m, at least, without its rounded ends
 BAY_AWAY = 5.5  # m from the crossing, at least
 CAR = (2.0, 0.9)  # m, half length and half width of a parked car
 CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
@@ -37,7 +37,7 @@ LINE_OUT = 0.25  # m by which stop lines reach beyond the bays on either side
 
 
 def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray:
-    """Positions (m) of the streets across one axis of the torus, `least` or more apart."""
+    """Positions (m), along one axis of the torus, of the streets that cross it, `least` m or more apart."""
     gaps = least + (SIDE - count * least) * rng.dirichlet(np.full(count, 2.0))
     return rng.uniform(0.0, SIDE) + np.concatenate([[0.0], np.cumsum(gaps[:-1])])
 

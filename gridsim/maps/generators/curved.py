@@ -14,11 +14,11 @@ from gridsim.jit import njit
 from gridsim.maps.lanes import Path, Plan, Scenario, backwards, beside, lay_lanes, sample, strips_along
 
 SIDE = 256.0  # m, of the torus
-MARGIN = 20.0  # m, corners from the torus's sides, so that the road does not cross them
+MARGIN = 20.0  # m from a corner to the torus's sides, at least, so that the road does not cross those
 LANE_WIDTH = 3.5  # m
 HALF_ROAD = 4.0  # m, centre line to the road's edge
 RADIUS = (16.0, 60.0)  # m, of the bends
-CORNERS = (8, 15)  # a loop has 8 to 14
+CORNERS = (8, 15)  # a loop has 8 to 14, if so many fit
 SPACING = 42.0  # m between corners, at least
 DRAWS = 60  # points from which corners are taken
 STRAIGHT = 5.0  # m between bends, at least
@@ -31,7 +31,7 @@ NEIGHBOURS = 24.0  # m along the road within which two points may be close to ea
 
 @njit
 def _tour(corners):
-    """Order corners [n, 2] as a closed tour by 2-opt, which leaves no crossing edges."""
+    """Order corners [n, 2], in place, as a closed tour by 2-opt, which leaves no crossing edges."""
     n = len(corners)
     better = True
     while better:

@@ -51,7 +51,7 @@ def roundabout_layout(rng: np.random.Generator) -> Plan:
 
 
 def lay_tiles(rng: np.random.Generator, edges: np.ndarray, share: float) -> Plan:
-    """The map of a graph; `share` of the T and crossing tiles are roundabouts."""
+    """The strips and lanes of a `tile_graph`; each T or crossing is a roundabout with probability `share`."""
     layout = Layout(HALF_ROAD, LANE_WIDTH)
     for tile in range(len(edges)):
         arms = [int(d) for d in np.flatnonzero(edges[tile])]

@@ -8,7 +8,7 @@ from gridsim.maps.generators.roundabout import lay_tiles
 from gridsim.maps.lanes import Plan, Scenario
 from gridsim.maps.tiles import tile_graph
 
-ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
+ROUNDABOUT_SHARE = 0.05  # probability that a T or crossing is a roundabout
 
 
 def seamless_layout(rng: np.random.Generator) -> Plan:

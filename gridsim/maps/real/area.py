@@ -12,24 +12,24 @@ from gridsim.jit import njit
 from gridsim.maps.real.description import Lane
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
-FINE = 2  # pixels per node of the field
+FINE = 2  # pixels per node of the field, along each axis
 PIXEL = 1.0 / (CELLS_PER_UNIT * FINE)  # m; the middle of every second pixel is a node
-SLIT = 2  # pixels by which the road is grown and shrunk again: slits up to twice as wide, gaps in the data, are filled
-ISLAND = 30.0  # m2; smaller pieces of wall, as inside of junctions, are filled, too
-_REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, of the longest distance in the field
+SLIT = 2  # pixels by which the road is grown, then shrunk: this fills gaps in the data up to twice as wide
+ISLAND = 30.0  # m2; smaller pieces of wall, such as those inside junctions, become road, too
+_REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, more than the field's largest distance
 
-AIR = 0.3  # m on each side of a narrow lane's cars, whose ends swing out in bends and as they change lanes
-SHARP = 0.1  # rad, turn of a sharp bend, at least
-SWEPT = 2.5  # m around a sharp bend that a car's corners may pass
+AIR = 0.3  # m of extra road on each side of cars in narrow lanes: their ends swing out in bends and lane changes
+SHARP = 0.1  # rad; where a lane turns by more than this at a point, the bend is sharp
+SWEPT = 2.5  # m around a sharp bend that become road, because a car's corners may sweep them
 _CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
-_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1  # pixels, of the longest distance off the road
+_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1  # pixels, more than the field's largest distance off the road
 
 
 def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.ndarray, gap: float) -> np.ndarray:
     """Clearance float32 [rows, columns] (m) at the nodes of a torus of this size (m).
 
-    Every lane has room for its cars: lanes narrower than `gap` m (`load.gap_of`) plus twice AIR are widened to that.
-    `outlines`, of junctions, are road, too.
+    Every lane has room for its cars: lanes narrower than `gap` (m, `load.gap_of`) plus twice AIR are widened to that
+    width. `outlines` are the areas [n, 2] (m) of junctions, which are road, too.
     """
     columns, rows = (round(float(side) / PIXEL) for side in size)
     picture = Image.new("L", (columns, rows))
@@ -45,7 +45,7 @@ def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.nd
     for outline in outlines:
         _fill(draw, outline, size)
     free = np.asarray(picture)
-    # Only the part with road is looked at, and what lies around it on the torus.
+    # Distances are computed only in the part with road and in a margin around it, wrapped over the torus.
     index = [_window(np.asarray(free.any(axis=1 - axis))) for axis in (0, 1)]
     free = _without_gaps(free.take(index[0], axis=0, mode="wrap").take(index[1], axis=1, mode="wrap") > 0)
     part = np.empty((len(index[0]) // FINE, len(index[1]) // FINE), dtype=np.float32)
@@ -57,7 +57,10 @@ def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.nd
 
 
 def _window(used: np.ndarray) -> np.ndarray:
-    """Indices of the `used` pixels of a ring, and of what is near; the first and their number are multiples of FINE."""
+    """Indices, to be wrapped, from the first to the last `used` pixel of a ring, with a margin on both sides.
+
+    The first index and the number of indices are multiples of FINE.
+    """
     first, last = np.flatnonzero(used)[[0, -1]]
     if last - first + 4 * _REACH > len(used):
         first, last = 0, len(used) - 1
@@ -66,21 +69,21 @@ def _window(used: np.ndarray) -> np.ndarray:
 
 
 def _widened(left: np.ndarray, right: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [n, 2] of a lane, farther apart where it is narrower than `least` m."""
+    """A lane's bounds [n, 2], moved apart to `least` m where the lane is narrower."""
     middle, half = (left + right) / 2, (left - right) / 2
     half *= np.maximum(least / np.maximum(2.0 * np.hypot(*half.T), 1e-9), 1.0)[:, None]
     return middle + half, middle - half
 
 
 def _corners(line: np.ndarray) -> np.ndarray:
-    """Points [n, 2] of a line at which it bends so sharply that a car's ends leave the lane."""
+    """The points [k, 2] of a line [n, 2] at which it bends so sharply (SHARP) that a car's ends leave the lane."""
     step = np.diff(line, axis=0)
     turn = np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
     return line[1:-1][abs(turn) > SHARP]
 
 
 def _fill(draw: ImageDraw.ImageDraw, outline: np.ndarray, size: np.ndarray) -> None:
-    """Fill a polygon [n, 2] (m), also where it passes the sides of the torus."""
+    """Draw a polygon [n, 2] (m) as road; what lies beyond a side of the torus is drawn at the opposite side."""
     low, high = np.floor(outline.min(axis=0) / size), np.floor(outline.max(axis=0) / size)
     for j in range(int(low[1]), int(high[1]) + 1):
         for i in range(int(low[0]), int(high[0]) + 1):
@@ -101,7 +104,10 @@ def _grown(region: np.ndarray) -> np.ndarray:
 
 
 def _without_gaps(free: np.ndarray) -> np.ndarray:
-    """Road with narrow slits and small islands filled: no wall is left that nodes of the field could miss."""
+    """The road [rows, columns] with narrow slits and small islands of wall made road, too.
+
+    No wall is left that is so thin that nodes of the field could miss it.
+    """
     free = ~_grown(~_grown(free))
     wall = ~free.reshape(free.shape[0] // FINE, FINE, -1, FINE).all(axis=(1, 3))
     labels, count = ndimage.label(wall)
@@ -112,10 +118,10 @@ def _without_gaps(free: np.ndarray) -> np.ndarray:
 
 @njit(nogil=True)
 def _signed(free, pixel, reach, outside, fine, nodes):
-    """Distance (m) of each node to the edge between road and wall, positive on the road.
+    """Write the distance (m) of each node to the edge between road and wall into `nodes`, positive on the road.
 
-    The edge is half a pixel before the nearest pixel of the other kind. That one is looked for within `reach` pixels of
-    nodes on the road, and within `outside` pixels of others.
+    The edge is half a pixel before the nearest pixel of the other kind, which is searched for within `reach` pixels of
+    a node on the road, and within `outside` pixels of a node off it.
     """
     rows, columns = free.shape
     along = np.full((rows, columns), reach, dtype=np.uint8)

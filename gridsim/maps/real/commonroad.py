@@ -14,7 +14,7 @@ NOT_FOR_CARS = {"sidewalk", "crosswalk", "bicycleLane", "busLane", "busStop", "b
 LIMIT_SIGNS = {"274", "R2-1", "r301", "maxspeed", "max_speed", "274.1"}  # Germany and Zamunda, USA, Spain, others
 COLOURS = {"red": "r", "redYellow": "r", "yellow": "y"}
 SHORTEST_CYCLE = 20.0  # s; if a cycle is shorter, its times are taken to be in s, not in steps
-MARK = "solid"  # a marking that may not be crossed has this name, or broad_ before it
+MARK = "solid"  # the marking of a line that may not be crossed; also with broad_ before it
 
 
 def read_commonroad(root: Element) -> RealRoad:
@@ -51,7 +51,7 @@ def read_commonroad(root: Element) -> RealRoad:
             _neighbour(lanelet, "Left"),
             _neighbour(lanelet, "Right"),
         )
-    for key, lane in lanes.items():  # a lanelet's light is at its end
+    for key, lane in lanes.items():  # a lanelet's light stands at its end, a `Lane.light` at the beginning
         for other in lane.successors:
             if other in lanes:
                 lanes[other].light = next((each for each in lit[key] if each), lanes[other].light)
@@ -64,7 +64,7 @@ def read_commonroad(root: Element) -> RealRoad:
 
 
 def _program(light: Element, step: float) -> str:
-    """`Lane.light` of a traffic light whose times are in steps of `step` s; "" for one that is off."""
+    """`Lane.light` of a traffic light whose times are in steps of `step` s; "" if it is off or has no cycle."""
     cycle = light.find("cycle")
     if cycle is None or light.findtext("active", "true") == "false":
         return ""
@@ -76,7 +76,7 @@ def _program(light: Element, step: float) -> str:
 
 
 def _neighbour(lanelet: Element, side: str) -> str:
-    """The lanelet on a side to which a car may change."""
+    """The lanelet on a side ("Left" or "Right") to which a car may change; "" if there is none."""
     beside = lanelet.find(f"adjacent{side}")
     mark = lanelet.findtext(f"{side.lower()}Bound/lineMarking", "")
     if beside is None or beside.get("drivingDir") != "same" or mark in (MARK, f"broad_{MARK}"):

@@ -1,4 +1,4 @@
-"""Roads that end at a file's edge get turning loops, or ways round the world: across the sides of the torus."""
+"""Roads that end get turning loops, or ways round the world: new roads across the sides of the torus."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from gridsim.maps.generators.roundabout import HALF_RING, RADIUS
 from gridsim.maps.lanes import Path, sample
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, groups_of, heading, part_of
 
-ROUND_RADIUS = 20.0  # m, of ways round the world
+ROUND_RADIUS = 20.0  # m, radius of the bends of ways round the world
 
 
 class Loop(NamedTuple):
     """A kind of turning loop."""
 
     radius: float  # m
-    width: float  # m, of its lane, at least
-    room: float  # m from its middle line to lanes of other roads, at least
+    width: float  # m, least width of its lane
+    room: float  # m between its middle line and those of other roads' lanes, at least
 
 
-ROOM = 4.2  # m from a narrow loop or a way round the world to lanes of other roads, at least
-NARROWEST = 3.5  # m, of such a loop or way
-# Tried in this order. Drivers of generated roundabouts can turn in a ring of the same size, but on roads with a higher
-# speed limit they come faster and need the wider first one. The last is for where there is little room.
+ROOM = 4.2  # m from the middle line of a narrow loop or a way round the world to those of other roads, at least
+NARROWEST = 3.5  # m, least width of the lane of a narrow loop or a way round the world
+# Tried in this order. The second is as large as a generated roundabout, in which drivers can turn; but on roads with a
+# higher speed limit, they come faster and need the first, which is larger. The last is for where there is little room.
 LOOPS = (Loop(RADIUS + 1.5, 2.0 * HALF_RING, 6.5), Loop(RADIUS, 2.0 * HALF_RING, 6.5), Loop(8.0, NARROWEST, ROOM))
 PARTNER = 45.0  # m between the end of a road and the beginning of the opposite direction, at most
 CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for its loop, tried in this order
-SPARE = 15.0  # m that are left of it, at least
+SPARE = 15.0  # m that are left of a shortened road, at least
 LOOP_SPEED = 30 / 3.6  # m/s, in a loop, at most
 WIDEST = 25.0  # m; lanes that end closer together than this end at the same end of a road
 LONGEST = 500.0  # m, of a way round the world
@@ -45,7 +45,7 @@ def shortest_curve(start: Pose, end: Pose, radius: float) -> Path:
     dx, dy = (end[0] - start[0]) / radius, (end[1] - start[1]) / radius
     d, toward, full = math.hypot(dx, dy), math.atan2(dy, dx), 2 * math.pi
     words: list[tuple[tuple[float, float, float], tuple[int, int, int]]] = []
-    for side in (1, -1):  # words that begin to the left, and in a mirror those that begin to the right
+    for side in (1, -1):  # Dubins's words (sequences of turns), and then their mirror images
         a, b = side * (start[2] - toward), side * (end[2] - toward)
         sa, sb, ca, cb, between = math.sin(a), math.sin(b), math.cos(a), math.cos(b), math.cos(a - b)
         square = 2.0 + d * d - 2.0 * between + 2.0 * d * (sa - sb)
@@ -78,7 +78,7 @@ class _Ground:
         self.added: list[np.ndarray] = []  # lines of new lanes
 
     def add(self, lanes: list[Lane]) -> None:
-        """Take the place that new lanes need."""
+        """Count new lanes among those that others must keep away from."""
         self.added += [self._within(_dense(lane.centre[:, :2])) for lane in lanes]
 
     def _within(self, points: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ def add_turning_loops(road: RealRoad) -> None:
 
 
 def _add_loop(road: RealRoad, ground: _Ground, one: list[str], other: list[str]) -> bool:
-    """Add a loop from a road's end to the beginning of its opposite direction, if there is room."""
+    """Add a loop from a road's end to the beginning of its opposite direction; returns whether there was room."""
     own = {*one, *other}
     for loop, cut in product(LOOPS, CUT_BACK):
         if cut and min(road.lanes[key].length for key in own) < cut + SPARE:
@@ -171,12 +171,15 @@ def _beside(one: Lane, other: Lane) -> bool:
 def _connections(
     lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, narrowest: float, shift: np.ndarray
 ) -> list[tuple[Lane, str]]:
-    """New lanes from the ends of `one` to the beginnings of `other`, moved by `shift`; each with its predecessor."""
+    """New lanes from the ends of `one` to the beginnings of `other`, which are moved by `shift` (m).
+
+    Each comes with the name of its predecessor.
+    """
 
     def away(keys: list[str], at: int, to: np.ndarray) -> list[str]:
         return sorted(keys, key=lambda key: float(np.hypot(*(lanes[key].centre[at, :2] - to))))
 
-    if heading(lanes[one[0]], -1) @ heading(lanes[other[0]], 0) < 0.0:  # the inner lanes of both first
+    if heading(lanes[one[0]], -1) @ heading(lanes[other[0]], 0) < 0.0:  # sorted, with the inner lanes of both first
         one = away(one, -1, lanes[other[0]].centre[0, :2] + shift)
         other = away(other, 0, lanes[one[0]].centre[-1, :2] - shift)
     count = max(len(one), len(other))
@@ -203,7 +206,7 @@ def _add(road: RealRoad, new: list[tuple[Lane, str]]) -> None:
 
 
 def join_round_the_world(road: RealRoad, sides: np.ndarray) -> None:
-    """Join roads that still end with roads that begin, across the sides of the torus."""
+    """Lead roads that still end to roads that begin elsewhere, also across the sides of the torus."""
     out, back = _open_groups(road.lanes)
     found = []
     for i, one in enumerate(out):

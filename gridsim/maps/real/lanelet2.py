@@ -1,4 +1,4 @@
-"""Lanelet2: relations of two bounds. A lanelet follows another where both its bounds go on from the other's."""
+"""Lanelet2: a lanelet is a relation of two bounds. It follows another one if its bounds begin where that one's end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gridsim.maps.real.description import Lane, RealRoad, paired, without_repeat
 
 CAR_ROADS = {"road", "highway", "play_street", "bus_lane", ""}
 LIMITS = {"urban": 50 / 3.6, "nonurban": 100 / 3.6, "private": 30 / 3.6}  # m/s, where a lanelet has none (Germany's)
-RADIUS = 6_378_137.0  # m, of WGS84
+RADIUS = 6_378_137.0  # m, semi-major axis of WGS84
 FLATTENING_SQUARED = 0.00669438  # first eccentricity squared of WGS84
 
 
@@ -24,7 +24,7 @@ def read_lanelet2(root: Element) -> RealRoad:
     dashed = {way.get("id", "") for way in root.iterfind("way") if _may_cross(_tags(way))}
     lanes: dict[str, Lane] = {}
     ends: dict[str, tuple[str, str, str, str]] = {}  # nodes: left first, right first, left last, right last
-    sides: dict[str, tuple[str, str]] = {}  # ways
+    sides: dict[str, tuple[str, str]] = {}  # the first way of the left and of the right bound
     others = broken = 0
     for relation in root.iterfind("relation"):
         tags = _tags(relation)
@@ -66,7 +66,7 @@ def _connect(
     sides: dict[str, tuple[str, str]],
     dashed: set[str],
 ) -> None:
-    """Successors of lanes, and their neighbours across lines that may be crossed."""
+    """Set the successors of lanes, and their neighbours across lines that may be crossed."""
     begins, right_of = defaultdict(list), defaultdict(list)
     for key, (left_first, right_first, _, _) in ends.items():
         begins[left_first, right_first].append(key)
@@ -74,7 +74,7 @@ def _connect(
     for key, lane in lanes.items():
         lane.successors = [other for other in begins[ends[key][2:]] if other != key]
         for other in right_of[sides[key][0]] if sides[key][0] in dashed else []:
-            if other != key and ends[other][1] == ends[key][0]:  # the shared line is driven the same way
+            if other != key and ends[other][1] == ends[key][0]:  # both run the same way along the line they share
                 lane.left_lane, lanes[other].right_lane = other, key
 
 
@@ -106,7 +106,7 @@ def _places(root: Element) -> tuple[dict[str, tuple[float, float, float]], tuple
 
 
 def _aligned(nodes: list[list[str]], places: dict[str, tuple[float, float, float]]) -> list[list[str]]:
-    """Both bounds in driving direction: beside each other, the left one on the left."""
+    """The nodes of a left and a right bound, each reversed if it runs against the driving direction."""
     left, right = nodes
 
     def apart(one: str, other: str) -> float:
@@ -123,7 +123,7 @@ def _aligned(nodes: list[list[str]], places: dict[str, tuple[float, float, float
 
 
 def _joined(ways: list[list[str]]) -> list[str]:
-    """The nodes of a bound of several ways, which follow each other in either direction."""
+    """The nodes of a bound that consists of several ways, one after the other; each may run in either direction."""
     line = list(ways[0]) if ways else []
     for way in ways[1:]:
         if way and line and way[0] != line[-1]:
@@ -148,7 +148,7 @@ def _may_cross(tags: dict[str, str]) -> bool:
 
 
 def _limit(tags: dict[str, str]) -> float:
-    """The limit (m/s) that a lanelet gives, in km/h if it names no unit; else that of its location."""
+    """Speed limit (m/s) from a lanelet's tag, which is in km/h if it names no unit; without a tag, by its location."""
     found = re.match(r"\s*([\d.]+)\s*(mph|mps|m/s)?", tags.get("speed_limit", ""))
     if not found:
         return LIMITS.get(tags.get("location", ""), math.nan)

@@ -38,12 +38,12 @@ from gridsim.reading import read_bytes
 
 NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
 MAX_NODES = 1 << 24  # of the field: 4 square km
-SHORTEST_SIDE = 64.0  # m; half of it is the longest range of rays
+SHORTEST_SIDE = 64.0  # m; no side of the torus is shorter
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
 SLOWEST_LIMIT = 15 / 3.6  # m/s; a lower limit must be in a wrong unit, and counts as none
-SPEEDS = 0.45, 0.95  # the interval within which speed counts, as shares of the usual limit
+SPEEDS = 0.45, 0.95  # the speed interval, as shares of the map's median limit (weighted by length)
 SIDES = {"right": 1.0, "left": -1.0}
-FASTEST = 27.0  # m/s, the upper end of the interval, at most
+FASTEST = 27.0  # m/s; the upper end of the speed interval is at most this
 
 
 def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: float | None = None) -> RealRoad:
@@ -68,17 +68,17 @@ def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: 
 
 @dataclass
 class Prepared:
-    """A real road made ready: everything of a map that depends on nothing of the configuration but `gap_of`."""
+    """A real road made ready: the parts of a map that depend on the configuration only through `gap_of`."""
 
     format: str
     notes: list[str]  # of `RealRoad`
     origin: np.ndarray  # float64 [2], m: the file's coordinates of the map's lower left corner
-    nodes: np.ndarray  # clearance float32 [rows, columns]; saved in steps of the field
-    network: Network  # without `speeds`, `clear` and `room`
+    nodes: np.ndarray  # clearance (m), float32 [rows, columns]; `save` rounds it to the bytes of a field
+    network: Network  # `speeds`, `clear` and `room` are zeros: `make_network` computes them
     limits: np.ndarray  # float64 [lanes], m/s
 
     def save(self, path: Path) -> None:
-        """Write it as arrays, so that reading them runs no code; whole, or not at all."""
+        """Write a file of plain arrays, so that loading it runs no code. It appears at `path` whole, or not at all."""
         field = np.clip((self.nodes - FIELD_FLOOR) * FIELD_STEPS + 0.5, 0, 255).astype(np.uint8)
         lanes = {f"lanes_{name}": array for name, array in self.network._asdict().items()}
         text = np.array([self.format, *self.notes])
@@ -99,7 +99,7 @@ class Prepared:
 
 
 def hand_of(lanes: dict[str, Lane]) -> float:
-    """The side on which traffic drives: 1 right, -1 left; by where the opposite lanes are."""
+    """The side on which traffic drives: 1 right, -1 left; found from where opposite lanes lie."""
     lines = [resampled(lane, math.ceil(lane.length / 3.0))[0] for lane in lanes.values() if not lane.junction]
     if not lines:
         return 1.0
@@ -114,7 +114,7 @@ def hand_of(lanes: dict[str, Lane]) -> float:
 
 
 def prepare(road: RealRoad, gap: float) -> Prepared:
-    """Select what can be driven, and shape it."""
+    """Select the lanes that can be driven, and make a network and a clearance field of them. This changes `road`."""
     if not (read := road.length):
         raise GridSimError(NO_ROAD)
     select.without_tight_turns(road)
@@ -184,7 +184,7 @@ def map_of(name: str, prepared: Prepared, config: SimConfig) -> Map:
 
 
 def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, float | None]:
-    """The path of a scenario's name, its crop and its side of the road.
+    """The path, the crop and the side of traffic (1 right, -1 left) in a scenario's name; None: the name gives none.
 
     The name may end in @LAT,LON,METRES or @X,Y,METRES, and in @left or @right.
     """
@@ -201,7 +201,7 @@ def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, floa
 
 
 def load_road(name: str, config: SimConfig) -> Map:
-    """The map of a file of real roads; the same object as long as the file does not change. Raises: GridSimError."""
+    """The map of a file of real roads, cached as long as the file does not change. Raises: GridSimError."""
     if config.unit < 1.0:
         raise GridSimError(f"{name}: real roads are for cars of 2.9 m or more, not of {config.vehicle.length:g} m")
     return load(os.path.abspath(name), file_digest(name), config)
@@ -224,7 +224,7 @@ def described(name: str, config: SimConfig) -> Prepared:
 
 
 def gap_of(config: SimConfig) -> float:
-    """The distance (m) of lanes' middle lines below which their cars may touch."""
+    """The distance (m) between lanes' middle lines below which their cars may touch."""
     return config.vehicle.width + config.traffic.beside
 
 

@@ -1,4 +1,4 @@
-"""What of a file's roads can be driven: a crop, no turns that are too tight, one level, and all of it joined."""
+"""Selects the lanes of a file that can be driven: in a crop, without tight turns, on one level, all connected."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gridsim.jit import njit
 from gridsim.maps.real.description import Lane, RealRoad, groups_of, heading, predecessors
 
 TIGHTEST = 3.5  # m, the least radius of a turn that traffic drives
-TURN = 1.75  # rad, 100 degrees: what may be turned within an arc of that radius
-NEARLY = 0.75  # of the largest component's length: components this long are kept, too
+TURN = 1.75  # rad (100 degrees), the most that a lane may turn within TURN * TIGHTEST m
+NEARLY = 0.75  # components at least this share as long as the largest one are kept, too
 APART = 2.5  # m of height between two ways, at least, if one passes above the other
-JOINT = 0.01  # m of the lanes before and after a lane that are looked at, for their directions
-END = 11.0  # m; lanes that cross within this distance of an end meet there
+JOINT = 0.01  # m by which a lane's line is extended into the lanes before and after it, to include the turns there
+END = 11.0  # m; lanes that cross this close to an end of one of them are taken to meet there, on one level
 
 
 def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
@@ -35,7 +35,7 @@ def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
 
 
 def cropped(road: RealRoad, middle: np.ndarray, side: float) -> None:
-    """Keep the lanes that lie in a square with this middle [2] and side (m)."""
+    """Keep the lanes that lie entirely in a square with this middle [2] and side (m)."""
     kept = {key for key, lane in road.lanes.items() if (abs(lane.centre[:, :2] - middle) <= side / 2).all()}
     road.lanes = keep(road.lanes, kept)
 
@@ -46,7 +46,7 @@ def without_tight_turns(road: RealRoad) -> None:
     kept = set()
     for key, lane in road.lanes.items():
         line = lane.centre[:, :2]
-        if lane.junction:  # it may be so short that it turns only where it joins others
+        if lane.junction:  # such a lane may be so short that it turns only where it joins others
             ahead = [heading(road.lanes[k], 0) for k in lane.successors[:1] if k in road.lanes]
             behind = [heading(road.lanes[k], -1) for k in before[key][:1]]
             line = np.array([line[0] - JOINT * d for d in behind] + [*line] + [line[-1] + JOINT * d for d in ahead])
@@ -62,7 +62,8 @@ def _is_tight(line: np.ndarray) -> bool:
     step = np.diff(line, axis=0)
     angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))])
-    last = np.searchsorted(along, along[1:] + TURN * TIGHTEST)  # of the pieces that begin within the arc
+    # last[i] is the first point that is not within an arc's length of the end of segment i.
+    last = np.searchsorted(along, along[1:] + TURN * TIGHTEST)
     return any(np.ptp(angle[i : max(last[i] - 1, i + 1)]) > TURN for i in range(len(angle)) if along[-1] > 0.0)
 
 
@@ -83,7 +84,7 @@ def _crossing(one, other):
 
 
 def on_one_level(road: RealRoad) -> None:
-    """Drop the lower of two ways that cross and do not meet: in the plane, one cannot drive under a bridge."""
+    """Drop the lower of two roads that cross but do not meet: a map is flat, so nobody can drive under a bridge."""
     keys = list(road.lanes)
     lines = [np.ascontiguousarray(road.lanes[key].centre) for key in keys]
     low, high = (np.array([ufunc(line[:, :2], axis=0) for line in lines]) for ufunc in (np.min, np.max))
@@ -110,7 +111,8 @@ def on_one_level(road: RealRoad) -> None:
 def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_line: np.ndarray) -> str:
     """Which of two lanes has to go, because it passes under the other; "" for none.
 
-    If heights do not tell, but they cross far from their ends and not in one junction: the one with the lower limit.
+    If heights do not tell, but the lanes cross far from their ends and not in one junction, it is the one with the
+    lower speed limit.
     """
     one, two = road.lanes[key], road.lanes[other]
     if other in one.successors or key in two.successors:
@@ -131,12 +133,12 @@ def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_lin
 
 
 def largest_connected(lanes: dict[str, Lane]) -> set[str]:
-    """The largest part (by m of lanes) that is connected, whatever the directions of its lanes."""
+    """The largest connected part (by m of lanes), whatever the lanes' directions, and others nearly as large."""
     return _largest(lanes, "weak")
 
 
 def largest_joined(lanes: dict[str, Lane]) -> dict[str, Lane]:
-    """The largest part (m) in which each lane leads on, and each can be reached from each other one."""
+    """The largest part (by m of lanes) in which every lane can be reached from all, and others nearly as large."""
     while True:
         before = len(lanes)
         lanes = keep(lanes, {key for key, lane in lanes.items() if lane.successors})
@@ -147,7 +149,7 @@ def largest_joined(lanes: dict[str, Lane]) -> dict[str, Lane]:
 
 
 def on_rings(onward: dict[str, list[str]]) -> set[str]:
-    """Which nodes of a graph, given by the nodes after each, lie on one closed way and no other."""
+    """The nodes of a graph whose strongly connected component is a single cycle. `onward`: each node's successors."""
     keys = list(onward)
     labels = _components(keys, [(key, other) for key in keys for other in onward[key]], "strong")
     label = dict(zip(keys, labels, strict=True))
@@ -157,7 +159,7 @@ def on_rings(onward: dict[str, list[str]]) -> set[str]:
 
 
 def _components(keys: list[str], pairs: list[tuple[str, str]], connection: str) -> np.ndarray:
-    """The number of the component of a graph in which each node is."""
+    """For each node (`keys`) of a graph with these edges (`pairs`), the number of its component: int [nodes]."""
     index = {key: k for k, key in enumerate(keys)}
     edges = np.array([(index[a], index[b]) for a, b in pairs if b in index], dtype=np.intp).reshape(-1, 2)
     graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(keys), len(keys)))
@@ -165,9 +167,10 @@ def _components(keys: list[str], pairs: list[tuple[str, str]], connection: str) 
 
 
 def _largest(lanes: dict[str, Lane], connection: str) -> set[str]:
-    """The largest component (m) of the graph of successors and changes of lanes, and others that are nearly as large.
+    """The lanes in the largest component (by m) of the graph of successors and lane changes, and in others nearly as
+    large (NEARLY).
 
-    On a ring, each direction is a component.
+    On a ring road, for example, each direction is a component.
     """
     keys = list(lanes)
     if not keys:

@@ -17,21 +17,24 @@ from gridsim.maps.network import ALWAYS, MOVING, NEVER, Network
 from gridsim.maps.real.description import Lane, groups_of, joined, part_of, predecessors
 from gridsim.maps.real.select import on_rings
 
-APPROACH = 15.0  # m, of a lane in which a car can stop before the next junction
-LEAST = 7.0  # m, of a lane where traffic waits or crosses: a car and its distance to the next one
+APPROACH = 15.0  # m; in a lane longer than this, a car can stop before the next junction
+LEAST = 7.0  # m, least length of a lane where traffic waits or crosses: a car and its gap to the next one
 DIVIDED = 0.5  # m between the sides of two lanes, beyond which cars do not change from one to the other
-ACROSS = 75.0  # m, of ways across a junction that are made one lane, at most
-ROUNDABOUT = 5  # lanes that conflict with one in a roundabout, at most: they join it or leave it
-WHOLE = 150.0  # m, of stretches that are joined to one lane, at most
-NEAR_END = 25.0  # m from a road's end within which what crosses it is part of the junction there
+ACROSS = 75.0  # m, greatest length of a way across a junction that is made one lane
+ROUNDABOUT = 5  # most lanes that conflict with a lane of a roundabout: they join it or leave it
+WHOLE = 150.0  # m, greatest length of a stretch of road that is joined to one lane
+NEAR_END = 25.0  # m from a road's end; lanes that cross the road within it are part of the junction at that end
 _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
-ASKEW = 1.0  # m, half the difference of a car's length and width: how much farther a car reaches that is turned
+ASKEW = 1.0  # m by which a car at right angles to a lane reaches closer than a parallel one: (length - width) / 2
 _SAME = 0.5  # m within which two lanes begin at the same place
 
 
 @njit
 def _near(one, other, width, height, gap):
-    """Whether cars on two polylines [n, 2] may touch: they are within `gap` m, or a bit more where they are askew."""
+    """Whether cars on two polylines [n, 2] may touch; `width` and `height` (m) are the torus's sides.
+
+    They may touch where the lines are less than `gap` m apart, or up to ASKEW more if the lines are at an angle there.
+    """
     for i in range(len(one) - 1):
         ux, uy = one[i + 1, 0] - one[i, 0], one[i + 1, 1] - one[i, 1]
         x, y = one[i, 0] + 0.5 * ux, one[i, 1] + 0.5 * uy
@@ -56,7 +59,8 @@ def _find_conflicts(points, offsets, candidates, width, height, gap):
             if not candidates[i, j]:
                 continue
             other, k = points[offsets[j] : offsets[j + 1]], 0
-            if math.hypot(one[0, 0] - other[0, 0], one[0, 1] - other[0, 1]) < _SAME:  # only behind their fork
+            # Of lanes that begin at the same place, only the parts beyond their fork count.
+            if math.hypot(one[0, 0] - other[0, 0], one[0, 1] - other[0, 1]) < _SAME:
                 while (
                     k < min(len(one), len(other))
                     and math.hypot(one[k, 0] - other[k, 0], one[k, 1] - other[k, 1]) < 2.0 * gap
@@ -73,7 +77,7 @@ def _line(lane: Lane) -> np.ndarray:
 
 
 def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.ndarray:
-    """A lane's line without what is close to its first point, if `first`, and to its last one, if `last`."""
+    """A lane's line without what is within 2 * `gap` m of its first point (if `first`) and its last one (if `last`)."""
     for end, joins in ((0, first), (-1, last)):
         if joins and len(line):
             far = np.flatnonzero(np.hypot(*(line - line[end]).T) >= 2.0 * gap)
@@ -82,9 +86,9 @@ def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.
 
 
 class Conflicts:
-    """Which lanes may collide: they come closer than `gap` m, and are not side by side.
+    """Pairs of lanes whose cars may collide: they come closer than `gap` m (`_near`), and are not side by side.
 
-    If one follows the other, what is close to the point where they join does not count.
+    If one lane follows the other, the parts close to the point where they join do not count.
     """
 
     def __init__(self, lanes: dict[str, Lane], gap: float, size: np.ndarray):
@@ -117,7 +121,7 @@ class Conflicts:
                         yield key, last
 
     def _add_loops(self) -> None:
-        """Add the conflicts of lanes with those that follow them and come back over or beside them."""
+        """Add the conflicts of each lane with lanes that follow it and come back over it or beside it."""
         for one, other in np.argwhere(self.follows).tolist():
             lines = self._seen_from(other, one), self._seen_from(one, other)
             if one != other and _near(*lines, *self.size, self.gap):
@@ -128,7 +132,7 @@ class Conflicts:
         return _beyond_joints(self.lines[other], self.follows[here, other], self.follows[other, here], self.gap)
 
     def is_loop(self, lanes: dict[str, Lane], key: str, other: str) -> bool:
-        """Whether lane `other`, which follows `key`, comes back to it: joined, they would cross themselves."""
+        """Whether lane `other`, which follows `key`, comes back to it: a lane joined of both would cross itself."""
         ring = key in lanes[other].successors
         one = _beyond_joints(_line(lanes[key]), ring, True, self.gap)
         return bool(_near(one, _beyond_joints(_line(lanes[other]), True, ring, self.gap), *self.size, self.gap))
@@ -142,7 +146,7 @@ class Conflicts:
         return bool(self.cross[self.index[key]].any())
 
     def zone(self, key: str) -> tuple[float, float]:
-        """From where to where (m) on a lane others come too close to it."""
+        """First and last arc length (m) of a lane at which lanes that conflict with it are too close."""
         here = self.index[key]
         line = self.lines[here]
         others = np.concatenate([self._seen_from(here, k) for k in np.flatnonzero(self.cross[here]).tolist()])
@@ -157,7 +161,7 @@ def _short(offsets: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def resampled(lane: Lane, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """Equally spaced points of a lane's middle line and half widths there: float64 [intervals + 1, 2], [...]."""
+    """Equally spaced points float64 [intervals + 1, 2] of a lane's middle line, and half widths [intervals + 1]."""
     line = lane.centre[:, :2]
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     half = np.hypot(*(lane.left - lane.right)[:, :2].T) / 2
@@ -174,7 +178,8 @@ def boxes_of(points: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.nd
 def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[str]]) -> list[str] | None:
     """The lanes that follow a group, if they are a group in the same order; otherwise None.
 
-    Each must be the only successor of its lane and have no other predecessor; no further lane may be beside them.
+    Each must be the only successor of the lane before it and have no other predecessor. No further lane may be beside
+    them.
     """
     onward = [lanes[key].successors for key in group]
     if any(len(keys) != 1 or len(before[keys[0]]) != 1 for keys in onward):
@@ -187,7 +192,10 @@ def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[st
 
 
 def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Join lanes that follow each other: up to WHOLE m, and none that conflicts, unless one is shorter than LEAST."""
+    """Join lanes that follow each other if they are WHOLE m long together at most, and none conflicts with any lane.
+
+    If one of the lanes is shorter than LEAST, these two conditions do not matter.
+    """
     crossed = {key for key in lanes if key in conflicts}
     before = predecessors(lanes)
     for group in groups_of(lanes):
@@ -209,7 +217,7 @@ def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _absorb(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Make short lanes part of all that lead to them, or of all that follow them."""
+    """Make short lanes part of all lanes that lead to them, or else of all lanes that follow them."""
     before = predecessors(lanes)
     for key in sorted(lanes, key=lambda name: lanes[name].length):
         lane, first = lanes[key], before[key]
@@ -245,9 +253,9 @@ def _absorb(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Join lanes that follow each other inside of a junction to one lane across it, on which no car has to wait.
+    """Join lanes that follow each other inside a junction to one lane across it, so that no car has to wait inside.
 
-    A lane before a fork becomes one for each branch. Roundabouts stay as they are: in them, cars may wait.
+    A lane that forks becomes one lane for each branch. Roundabouts stay as they are: cars may wait inside them.
     """
     before = predecessors(lanes)
     crossed = {key for key in lanes if key in conflicts}
@@ -289,7 +297,7 @@ def _is_alone(lane: Lane) -> bool:
 
 
 def _give_tail(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
-    """Make the last `length` m of a road part of its successors, if these follow only it; returns whether it did."""
+    """Make the last `length` m of a group of lanes part of their successors; returns whether that was possible."""
     onward = [(key, s) for key in group for s in lanes[key].successors]
     if min(lanes[key].length for key in group) < length + LEAST or any(
         before[s] != [key] or s in group or not _is_alone(lanes[s]) for key, s in onward
@@ -305,7 +313,7 @@ def _give_tail(lanes: dict[str, Lane], before: dict[str, list[str]], group: list
 
 
 def _give_head(lanes: dict[str, Lane], before: dict[str, list[str]], group: list[str], length: float) -> bool:
-    """Make the first `length` m of a road part of the lanes that lead to it, if only to it; returns whether it did."""
+    """Make the first `length` m of a group of lanes part of their predecessors; returns whether that was possible."""
     if min(lanes[key].length for key in group) < length + LEAST or any(
         lanes[p].successors != [key] or p in group or not _is_alone(lanes[p]) for key in group for p in before[key]
     ):
@@ -336,7 +344,7 @@ def _split(lanes: dict[str, Lane], group: list[str], share: float) -> list[str]:
 
 
 def _lengthen(lanes: dict[str, Lane]) -> None:
-    """Give short lanes a piece of the road before or after them."""
+    """Make lanes shorter than LEAST longer by a piece of the road before or after them."""
     before = predecessors(lanes)
     for key in list(lanes):
         lane = lanes[key]
@@ -377,7 +385,7 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _unlink(lanes: dict[str, Lane], gap: float) -> None:
-    """Let lanes that run into one another, or apart, be neighbours no longer."""
+    """Make lanes that run into one another or apart neighbours no longer."""
     for group in groups_of(lanes):
         for left, right in pairwise(group):
             n = max(math.ceil(lanes[left].length / LANE_STEP), 1)
@@ -409,8 +417,9 @@ def shaped(lanes: dict[str, Lane], gap: float, size: np.ndarray) -> tuple[dict[s
 
 
 def _yields(lanes: list[Lane], cross: np.ndarray) -> np.ndarray:
-    """`Network.yields` of lanes that conflict. If two would give way to each other, as ways over several junctions may,
-    neither does.
+    """`Network.yields` of the pairs of lanes that conflict (`cross`, bool [lanes, lanes]).
+
+    If two would give way to each other, as lanes across several junctions may, neither does.
     """
     gives_way = np.zeros_like(cross)
     for k, j in np.argwhere(cross):
@@ -423,7 +432,7 @@ def _yields(lanes: list[Lane], cross: np.ndarray) -> np.ndarray:
 
 
 def network_of(lanes: dict[str, Lane], conflicts: Conflicts, hand: float) -> Network:
-    """The network of shaped lanes; without `speeds`, `clear` and `room`."""
+    """The network of shaped lanes. `speeds`, `clear` and `room` are zeros: `make_network` computes them."""
     intervals = {}
     for group in groups_of(lanes):
         longest = max(lanes[key].length for key in group)

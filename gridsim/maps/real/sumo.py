@@ -1,4 +1,4 @@
-"""SUMO's nets, and what its `netconvert` makes into one: OpenStreetMap and OpenDRIVE."""
+"""SUMO nets, and the formats that SUMO's `netconvert` converts to one: OpenStreetMap and OpenDRIVE."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_rep
 from gridsim.maps.real.lights import program
 
 TIME_LIMIT = 120.0  # s
-COLOURS = {"r": "r", "u": "r", "y": "y", "Y": "y"}  # of a link in a phase; all others are green, or off
+COLOURS = {"r": "r", "u": "r", "y": "y", "Y": "y"}  # by SUMO's signal state; all others, also off, count as green
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
     "osm": [
@@ -31,7 +31,7 @@ OPTIONS = {
         "--keep-edges.by-vclass=passenger", "--opendrive.curve-resolution=0.5", "--output.original-names",
     ],
 }  # fmt: skip
-# Boxes in which traffic keeps left: south, west, north, east (degrees). First come boxes in which it does not.
+# Boxes (degrees): south, west, north, east. Traffic keeps left in those of LEFT_HAND, except in those of RIGHT_HAND.
 RIGHT_HAND = [
     (5.6, 92.0, 28.5, 97.3), (14.0, 101.0, 23.4, 109.5), (8.0, 103.3, 14.0, 109.5),  # Myanmar, Laos, Vietnam, Cambodia
     (33.0, 124.5, 43.0, 129.4),  # Korea
@@ -84,8 +84,8 @@ def convert(
             notes.append("traffic keeps left, as the country of the coordinates does")
     else:
         lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data if hand is None else hand < 0.0
-    # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. Without junctions,
-    # what it makes of the file as one that keeps right is correct, except that lanes lead the wrong way.
+    # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. If such a file
+    # has no junctions, it is converted as one that keeps right: then only the directions of the lanes are wrong.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
     options += ["--lefthand"] * (lefthand and not turned)
     net = _netconvert(path, data, kind, options)
@@ -98,13 +98,13 @@ def convert(
 
 
 def _netconvert(path: Path, data: bytes, kind: str, options: list[str]) -> bytes:
-    """Run netconvert. Raises: GridSimError with its first line of errors."""
+    """The SUMO net (XML) that netconvert makes of a file. Raises: GridSimError with the first line of its errors."""
     spec = find_spec("sumo")
     home = Path((spec.submodule_search_locations or [""])[0]) if spec else None
     if home is None or not (home / "bin" / "netconvert").is_file():
         raise GridSimError(f"{path}: reading this format needs SUMO's netconvert: {INSTALL}")
     with tempfile.TemporaryDirectory(prefix="gridsim-road-") as folder:
-        # netconvert takes spaces and commas in names for ends of names, so it gets a name of ours.
+        # netconvert takes a space or comma in a file's name for the name's end, so the file gets a name without them.
         Path(folder, "road.xml").write_bytes(data)
         errors = ""
         for more in ([], ["--ignore-errors"]):
@@ -143,7 +143,7 @@ def _limits(root: Element) -> dict[str, float]:
 
 
 def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
-    """A SUMO net. Each connection is a lane of its own through its junction; `limits`: m/s by OpenDRIVE road."""
+    """The roads of a SUMO net, with a lane for each connection through a junction; `limits`: m/s by OpenDRIVE road."""
     inner: dict[str, Element] = {}
     lanes: dict[str, Lane] = {}
     numbered: dict[tuple[str, int], str] = {}
@@ -236,7 +236,10 @@ def _name(connection: Element) -> str:
 
 
 def _right_of_way(root: Element) -> dict[str, frozenset[str]]:
-    """The connections to which each gives way. A junction numbers its own in the order of the lanes that lead to it."""
+    """For each connection (`_name`), those to which it gives way.
+
+    A junction numbers its connections in the order of the lanes that lead to it.
+    """
     of_lane, yields = defaultdict(list), {}
     for connection in root.iterfind("connection"):
         of_lane[f"{connection.get('from')}_{connection.get('fromLane')}"].append(_name(connection))
@@ -263,7 +266,7 @@ def _program(logic: Element) -> list[str]:
 
 
 def _curve(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """A curve [n, 3] from the end of one line to the beginning of another, along both."""
+    """A curve [n, 3] from the end of one line to the beginning of another, tangent to both."""
     a, d = start[-1], end[0]
     reach = np.hypot(*(d - a)[:2]) / 3
     if reach < 0.05:
@@ -288,7 +291,7 @@ def _turn_round(road: RealRoad) -> None:
 
 
 def _set_neighbours(lanes: dict[str, Lane], one: str, other: str) -> None:
-    """Mark two lanes of an edge as neighbours; which is on the left, the geometry tells."""
+    """Mark two lanes of an edge as neighbours; the geometry tells which is on the left."""
     a, b = lanes[one].centre[:, :2], lanes[other].centre[:, :2]
     along, away = a[-1] - a[0], b.mean(axis=0) - a.mean(axis=0)
     left, right = (other, one) if along[0] * away[1] - along[1] * away[0] > 0.0 else (one, other)
