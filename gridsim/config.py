@@ -218,8 +218,8 @@ class SimConfig:
     def unit(self) -> float:
         """The unit in m: 1, or for cars shorter than 2.8 m one of 1/2, 1/4, 1/8 and 1/16.
 
-        Generated roads, walls and the resolution of maps are sized in units. Speeds scale with the square root of the
-        unit (Froude's law).
+        Generated roads, walls and the resolution of maps are sized in units. Roads' speeds are multiplied by the square
+        root of the unit (Froude's law); those in `vehicle` are not.
         """
         return max(2.0 ** min(round(math.log2(self.vehicle.length / LENGTH)), 0), LEAST_UNIT)
 

@@ -160,7 +160,10 @@ def exact(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def freeze(array: np.ndarray) -> np.ndarray:
-    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
+    """The array C-contiguous and read-only: a view, or a copy if it is not contiguous.
+
+    Kernels take what they only read in this form; for any other, Numba would compile them once more.
+    """
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)
     return view

@@ -127,7 +127,7 @@ def everything_by_default() -> list[RunSettings]:
 
 
 def main(part: str, *what: str) -> None:
-    """Compile one part, or everything, in this process."""
+    """Compile one part for one run, or all parts for all runs by default settings, in this process."""
     if part != "everything":
         scenario, sim, policy, traffic, *rest = what
         compile_part(part, scenario, sim, policy, int(traffic), *rest)

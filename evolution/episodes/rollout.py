@@ -215,7 +215,8 @@ def _act(constants, car, history, action, command):
 def _drive(simulation, setup, car, workspace, world, action):
     """One control step with an action. Returns an End as a number.
 
-    As a `leaf`, this code counts no references. Written into `run_episode`, it would, and be 15 % slower among 8 cars.
+    As a `leaf`, this code is inlined without counting references to arrays. Written out in `run_episode`, it would
+    count them, and drives among 8 cars would be 15 % slower.
     """
     acceleration, steering = _act(simulation.constants, car, workspace.history, action, workspace.command)
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)

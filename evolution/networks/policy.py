@@ -46,9 +46,9 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`, also with `+continuous`.
+        """Read a text such as `mlp:6,7+motion+steering`, `cnn` or `cnn:16,32,256@4`, each also with `+continuous`.
 
-        Raises: GridSimError for any other text.
+        Raises: GridSimError if a text has another form or its sizes are not allowed.
         """
         network = text.removesuffix(CONTINUOUS)
         actions: Actions = "discrete" if network == text else "continuous"

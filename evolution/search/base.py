@@ -82,7 +82,7 @@ class Search(ABC):
     def _tell(self, asked: Generation, scores: np.ndarray) -> None: ...
 
     def ask(self) -> Generation:
-        """The next generation."""
+        """The generation to evaluate now; it stays the same until `tell` is called."""
         self.asked = self._ask(int(self._rng(0).integers(1 << 63)))
         return self.asked
 

@@ -31,7 +31,7 @@ class Feature(NamedTuple):
     unit: np.float32  # the value that networks read as 1 before the shift, or if `near` as 0
     near: bool = False  # networks read a value v as 2 v / (v + unit) - 1, which resolves small values best
     least: np.float32 = -ONE  # the smallest number that the environment returns
-    shift: float = 0.0  # networks read value / unit + shift, unless `near`
+    shift: float = 0.0  # networks read value / `Feature.unit` + shift, unless `near`
     mirror: float = 1.0  # factor of the values in a mirrored world
     reversed: bool = True  # whether the values have the opposite order in a mirrored world
     sees: str = ""  # what networks see, for help; only those that name it do (`mlp:64+steering`); "": all see it

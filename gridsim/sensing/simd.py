@@ -22,7 +22,7 @@ SIMD_RAYS = 32
 # of the slowest ray.
 _NEAR = F(2.0)  # clearance below which Newton steps are taken
 _STRETCH = F(1.5)  # a stretched step, taken above _NEAR, is this times the clearance
-_CLOSE = F(0.04)  # clearance at which a ray has arrived
+_CLOSE = F(0.04)  # a ray that is nearer than this to the edge, on either side, has arrived
 _SLOPE_MIN = F(0.1)  # least slope of a Newton step, which is thus at most ten times the clearance
 LEAP = F(2.0)  # most by which a Newton step exceeds a stretched one: any step is then below clearance + THICK_WALL
 MARGIN = F(0.1)  # among thin walls, the leap is the thinnest wall's thickness less this, for safety

@@ -199,7 +199,7 @@ def _find_gaps(network, drivers, world, ego):
         way = speed * (config.LOOK_AHEAD_TIME + speed / (F(2.0) * drivers.comfort))  # to notice something and to stop
         world[i, s.HORIZON] = drivers.jam + config.LOOK_AHEAD + way
         world[i, s.GAP], world[i, s.LEAD_SPEED] = F(1e9), ZERO
-    # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
+    # A gap ends at the rear of the car ahead, widened by CAUTION. That car's middle may lie beyond the horizon.
     beyond = F(2.0) * (drivers.half_length + config.CAUTION)
     for i in range(cars):
         if world[i, s.LANE] < ZERO:

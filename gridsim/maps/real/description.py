@@ -42,14 +42,12 @@ class Lane:
 
 @dataclass
 class RealRoad:
-    """The roads of a file, in its own coordinates (m)."""
+    """The roads of a file, in m: in its x and y, or in a local plane if it has longitude and latitude."""
 
     format: str  # the format's name for users, such as OpenStreetMap
     lanes: dict[str, Lane]
     junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
-    degrees: tuple[
-        float, ...
-    ] = ()  # longitude and latitude of x = y = 0, m per degree of each; (): the file has metres
+    degrees: tuple[float, ...] = ()  # Lanelet2's: longitude and latitude of x = y = 0, m per degree of each; else ()
     hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0: unknown (`load.hand_of`)
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 

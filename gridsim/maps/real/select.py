@@ -84,7 +84,10 @@ def _crossing(one, other):
 
 
 def on_one_level(road: RealRoad) -> None:
-    """Drop the lower of two roads that cross but do not meet: a map is flat, so nobody can drive under a bridge."""
+    """Of two roads that cross but do not meet, drop the lower one, or without heights the slower one.
+
+    A map is flat: nobody can drive under a bridge.
+    """
     keys = list(road.lanes)
     lines = [np.ascontiguousarray(road.lanes[key].centre) for key in keys]
     low, high = (np.array([ufunc(line[:, :2], axis=0) for line in lines]) for ufunc in (np.min, np.max))
