@@ -10,7 +10,8 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from time import perf_counter
+from typing import Any, TypeVar
 
 from cluster.evaluator import Evaluator
 from cluster.fitness import Fitness, give
@@ -41,6 +42,7 @@ __all__ = [
     "train_dqn",
 ]
 
+Settings = TypeVar("Settings", bound=RunSettings)
 OnStep = Callable[[int, dict[str, float]], None]
 Trained = tuple[Champion, list[dict[str, float]]]
 
@@ -65,25 +67,25 @@ def evolve(
     2
 
     Args:
-        settings: what the command's flags set; alternatively give these by name, such as scenario="city".
+        settings: what gridsim-evolve's flags for learning set. Give these here, or by name, such as scenario="city".
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
             with fields distance (m), paced (m at a speed within the road's interval), steps, end (`gridsim.state.End`),
             and figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
             `evolution.episodes.fitness.scalar`. A string is a name as for --fitness.
         workers: number of Ray workers; 0 without `address`: this process evaluates, on all its cores.
-        on_generation: called with the number of generations done and the latest one's figures.
-        folder: where to keep the run, as gridsim-evolve does in runs/NAME; None keeps nothing.
-        resume: go on with the run in `folder` if there is one.
+        on_generation: called after each generation with the number of those done and the latest one's figures.
+        folder: a new folder in which the run is kept, as gridsim-evolve does in runs/NAME; None keeps nothing.
+        resume: go on with the run in `folder` if there is one; its settings must be these, but limits may be raised.
         address: a Ray cluster, host:port or "auto", to run the workers on instead of this machine; with it, 0 workers
             mean one for each free CPU.
         tracking_uri: MLflow's address, to which a run with a folder is sent; None sends nothing.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
     `.../mean` is over all members on training episodes, `.../best` of the leader (the best genome known before the
-    generation) on longer episodes of its own.
+    generation) on longer episodes of its own, or of the best member in a generation without a leader, the first.
     Raises: GridSimError; the message is one line.
     """
-    settings = settings or EvolveSettings(**flags)
+    settings = _settings(EvolveSettings, settings, flags)
     if fitness:
         settings = replace(settings, fitness=fitness if isinstance(fitness, str) else give(fitness))
     return _train(settings, workers, on_generation, folder, resume, address, tracking_uri)
@@ -105,9 +107,12 @@ def train_dqn(
     >>> import gridsim
     >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
 
-    Arguments and result are as for `evolve`, with an evaluation in place of a generation.
+    Arguments and result are as for `evolve`, with an evaluation in place of a generation, and without `fitness`. In the
+    history, `distance_m/mean` and `speed_mps/mean` are over the training episodes since the evaluation before,
+    `.../best` is the network's in validation.
+    Raises: GridSimError, with a one-line message; FloatingPointError if the network diverged.
     """
-    settings = settings or DqnSettings(**flags)
+    settings = _settings(DqnSettings, settings, flags)
     return _train(settings, workers, on_evaluation, folder, resume, address, tracking_uri)
 
 
@@ -119,7 +124,8 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
     Returns: a row for each run: run (its folder), scenario, learner, seed, traffic, and the figures as table.csv names
     them; an error that could not be measured is nan.
-    Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
+    Raises: GridSimError, with a one-line message, if a run is not finished or is damaged, or if two folders hold the
+    same one.
     """
     from cluster.compare.plan import read_runs
     from cluster.compare.results import measured
@@ -129,6 +135,13 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
         {"run": str(run.folder), **{name: getattr(run.settings, name) for name in names}, **run.figures}
         for run in map(measured, read_runs(map(Path, runs)))
     ]
+
+
+def _settings(kind: Callable[..., Settings], settings: Settings | None, flags: dict[str, Any]) -> Settings:
+    """The settings that were given, as an object or by name. Raises GridSimError for both."""
+    if settings and flags:
+        raise GridSimError(f"give settings, or {', '.join(flags)} by name; to change settings, dataclasses.replace")
+    return settings or kind(**flags)
 
 
 def _train(
@@ -147,9 +160,10 @@ def _train(
     pool: WorkerPool | None = None
     try:
         pool = open_pool(workers, cluster, 0.0, maps.build)
-        learning = new_learning(settings, pool, maps)
+        learning, begun = new_learning(settings, pool, maps), perf_counter()
         while not learning.done():
             finish(learning.step())
+            learning.add_wall_clock(perf_counter() - begun)
             learning.elites.clear()  # needed only for a run's folder
             on_row(learning.steps, learning.history[-1])
         finish(learning.choose_champion())
@@ -166,7 +180,7 @@ def _train(
 def _train_in(
     folder: Path, settings: RunSettings, place: Place, on_row: OnStep, resume: bool, tracking_uri: str | None
 ) -> Trained:
-    """Train a new run in a folder, or resume the run in it. If that is finished already, it is only read."""
+    """Train a new run in a folder, or resume the run in it. A run that is finished already is only read."""
     if resume and (folder / CHECKPOINT).is_file():
         run = open_run(folder)
         settings = settings.extending(run.settings)

@@ -51,14 +51,15 @@ class Evaluator:
         """Open the pool of workers, which `close`, or the end of a `with`, ends.
 
         Args:
-            scenario: a road's name, or a map file.
+            scenario: as for --scenario of gridsim-evolve: a road's name, a map file, or several, separated by commas.
             policy: the network, as for --policy of gridsim-evolve, with the same default.
-            traffic: number of other cars, or "usual" or "heavy"; -1 is as many as the road has by default.
+            traffic: number of other cars, or "usual" or "heavy"; -1 is as by default in gridsim-evolve.
             sim: the simulator's configuration (vehicle, sensors, episodes, traffic), or the name of a preset or of a
                 YAML file; "" is as by default in gridsim-evolve. A lower target and time limit make an evaluation
                 shorter.
-            workers, address: number of Ray workers, and a Ray cluster's address; by default threads of this process.
-            episodes: how many each genome drives.
+            workers, address: number of Ray workers, and a Ray cluster's address, by default RAY_ADDRESS; with neither,
+                threads of this process.
+            episodes: how many each genome drives, on all roads together.
             actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
 
         Raises: GridSimError, a ValueError, in one line.
@@ -67,6 +68,8 @@ class Evaluator:
         if policy:
             spec = PolicySpec.parse(policy)
             given["observation"], actions = spec.observation, spec.actions if spec.suffix else actions
+        if isinstance(sim, SimConfig) and sim.unit < 1.0 and traffic == -1:
+            traffic = 0  # as by default for small cars; the settings do not know this one
         settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, actions=actions, **given)
         settings.check()
         check_workers(workers, 0.0)
@@ -99,7 +102,7 @@ class Evaluator:
 
         Returns: the results, structured, [n, episodes], with the fields that `gridsim.evolve` gives to a fitness. They
         are the same bits for any number of workers.
-        Raises: GridSimError for genomes that do not fit.
+        Raises: GridSimError for genomes that do not fit or are not finite, and for a negative seed.
         """
         return self._drive(genomes, self._draw(seed), comfort=True)
 

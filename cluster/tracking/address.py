@@ -38,14 +38,15 @@ class TrackingError(GridSimError):
 
 
 def check_uri(uri: str | None = None, begun_with: str = "") -> str:
-    """The tracking address to use, made absolute and probed, without MLflow.
+    """The tracking address to use, checked without MLflow: a SQLite path is made absolute, and a server is probed.
 
     It is `uri`; if that is None or "", `begun_with` (the address of a resumed run), else MLFLOW_TRACKING_URI, else
-    DEFAULT_URI. If MLFLOW_TRACKING_URI is the same address with a password, this is added, so that no file and no flag
-    needs to hold it. A server is not probed if `begun_with` is used or in a comparison's run (MLFLOW_RUN_CONTEXT is
-    set): such runs go on without it. A hosted store is never probed. Raises TrackingError for a server that does not
-    answer, a SQLite database that cannot be written or that another version of MLflow made, a folder (MLflow 3 stores
-    nothing in folders), and an unknown scheme.
+    DEFAULT_URI. If MLFLOW_TRACKING_URI is the same address with user and password, these are added, so that no file and
+    no flag needs to hold them. A server is not probed if `begun_with` is used or in a comparison's run
+    (MLFLOW_RUN_CONTEXT is set): such runs go on without it. A hosted store or a plug-in's is never probed. Raises
+    TrackingError for what cannot be used, such as a probed server that does not answer, a SQLite database that cannot
+    be written or that another version of MLflow made, a folder (MLflow 3 keeps no runs in folders), an unknown scheme,
+    or an address that its password makes unclear.
     """
     reach_loopback_directly()
     probed = (not uri and bool(begun_with)) or "MLFLOW_RUN_CONTEXT" in os.environ
@@ -69,12 +70,15 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
 
 
 def unreachable(uri: str) -> str:
-    """Why the MLflow or database server at an address does not answer now; "" if it does, or if there is no server."""
+    """Why no MLflow or database server answers at an address now; "" if one does.
+
+    It is also "" for an address that names no server to be asked, such as a SQLite file's or a hosted store's.
+    """
     scheme = address_scheme(uri)
     if scheme in _SERVERS:
         return _server_problem(redacted(uri))
     if scheme in _DATABASES:
-        parts = urllib.parse.urlsplit(redacted(uri))  # no password, in which a colon would be taken for the port's
+        parts = urllib.parse.urlsplit(redacted(uri))  # redacted: a colon in a password would be taken for the port's
         try:
             if parts.hostname:  # an address without a host is a Unix socket's
                 socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
@@ -105,7 +109,7 @@ def run_table(server: str, experiment_id: str) -> str:
 
 
 def address_scheme(uri: str) -> str:
-    """The scheme of a tracking address, without a database's driver; "" for a folder."""
+    """The scheme of a tracking address, in lower case and without a database's driver; "" for a mere path."""
     return _HOSTED if uri == _HOSTED else uri.partition(":")[0].partition("+")[0].lower() if ":" in uri else ""
 
 
@@ -120,9 +124,13 @@ def is_locked(error: str | None) -> bool:
 
 
 def with_password(saved: str) -> str:
-    """`saved`, an address from a file or a flag; with user and password if MLFLOW_TRACKING_URI has them for it."""
-    usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
-    return usual if redacted(usual) == redacted(saved) and not saved.endswith(UNCLEAR) else saved
+    """`saved`, an address from a file or a flag, with the password that MLFLOW_TRACKING_URI has for it.
+
+    So a file or a flag needs to hold no password. An address that holds one stays as it is.
+    """
+    usual, shown = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/"), redacted(saved)
+    same = redacted(usual) == shown == saved.rstrip("/")
+    return usual if same and not saved.endswith(UNCLEAR) else saved
 
 
 def reach_loopback_directly() -> None:
@@ -136,9 +144,10 @@ def reach_loopback_directly() -> None:
 
 
 def _check_sqlite(uri: str) -> str:
-    """A SQLite address with an absolute path.
+    """The SQLite address `uri` with an absolute path; its database may be missing, empty or locked.
 
-    Raises TrackingError if the database or its folder cannot be written, or another version of MLflow made it.
+    Raises TrackingError if it names no file, if the database or its folder cannot be written, or if another version of
+    MLflow made the database.
     """
     path, shown = sqlite_path(uri), redacted(uri)
     if path is None or path.is_dir():
@@ -181,7 +190,7 @@ def sqlite_uri(path: Path, query: str | None = None) -> str:
 
 
 def schema_problem(revision: str | None, uri: str) -> str:
-    """Why a database with this schema revision must not be used, in one line; "" if it may be.
+    """Why a database with this schema revision (None: none yet) must not be used, in one line; "" if it may be.
 
     MLflow would migrate an older database at once. The older MLflow that made it, perhaps another user's, could then no
     longer open it.

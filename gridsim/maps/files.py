@@ -1,7 +1,7 @@
 """Maps from files: a picture in which bright pixels are road, or the YAML form of ROS's map_server with a picture.
 
-Unknown pixels are wall, and so is everything outside the picture. World coordinates have their origin at the picture's
-lower left corner; a file's own coordinates are turned and shifted by its `origin`.
+Unknown pixels (`MapFile.unknown`) are wall, and so is everything outside the picture. World coordinates have their
+origin at the picture's lower left corner; a file's own coordinates are turned and shifted by its `origin`.
 
 A file gives the same road for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
@@ -28,6 +28,7 @@ from gridsim.config import FILE_SPEEDS, LIMITS, SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.closing import NODE
 from gridsim.maps.map import Map, without_lanes
+from gridsim.maps.parts import YAMLS
 from gridsim.maps.raster import (
     HALF_WALL,
     OUTSIDE,
@@ -42,7 +43,6 @@ from gridsim.reading import number, read_bytes, read_yaml, shown
 
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
-YAMLS = (".yaml", ".yml")
 KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed"]
 
 MAX_PIXELS = 1 << 26
@@ -53,7 +53,7 @@ PLACE, TURN = (-1e8, 1e8), (-2 * math.pi, 2 * math.pi)  # m, rad
 SHORTEST_SIDE = 16  # in units (`SimConfig.unit`), of the field
 UNKNOWN = 205  # of 255, the grey of unknown pixels in maps that robots save
 ALIKE = 0.8  # similarity (`difflib.SequenceMatcher.ratio`) above which an unknown key is a known one, misspelt
-MOST_BORDER = 0.5  # if this share of a picture's border, or more, is road, it is taken for a drawing's surroundings
+MOST_BORDER = 0.5  # if this share of a picture's border, or more, is road, that road is taken for surroundings
 MOST_CLOSED = 0.05  # share of the road; a warning is given if this much of it, or more, is closed
 
 
@@ -70,7 +70,7 @@ class MapFile:
     # In the file's own coordinates: x, y (m) of the picture's lower left corner, and the heading (rad) of its rows.
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     negate: bool = False  # whether dark pixels are road
-    free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
+    free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road; if `negate`, brightness
     unknown: bool = False  # whether pixels of the grey UNKNOWN are wall, whatever the threshold says
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: Sequence[Sequence[float]] = ()
@@ -79,7 +79,7 @@ class MapFile:
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:
-    """The map of a file, cached while neither the file nor the configuration changes.
+    """The map of a file. The last four maps are cached, each for one content of its files and one configuration.
 
     Warns (MapWarning) when it is built: of what is ignored or closed, if the road is very short, and if the picture
     seems inverted. Raises: GridSimError.
@@ -196,7 +196,10 @@ def read_free(file: MapFile) -> np.ndarray:
 
 
 def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
-    """Decode a picture: bool [rows, columns], True for road, which is opaque and below the threshold of darkness."""
+    """Decode a picture: bool [rows, columns], True for road, the highest row first.
+
+    Road is opaque, below the threshold of darkness (if `negate`, of brightness), and not a grey that means unknown.
+    """
     opaque: np.ndarray | bool = True
     if picture.mode.startswith("I"):
         light, full = np.asarray(picture).astype(np.uint16), 65_535

@@ -1,8 +1,8 @@
 """Which maps are for training, which for the choice of the champion, and which only for the final report.
 
 Each map has a seed, and seeds are in three parts. A generated road has a new map for each seed; the files of a folder
-are divided among the parts; and on a single file, episodes of each part begin in regions of their own. If a scenario's
-name lists n roads, these take turns: in each part, the k-th seed (from 0) is for road k modulo n.
+are divided among the parts; and on a single file, unless it is small, episodes of each part begin in regions of their
+own. If a scenario's name lists n roads, these take turns: in each part, the k-th seed (from 0) is for road k modulo n.
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
 # A square of a file: PATH@X,Y,METRES or PATH@LAT,LON,METRES (its middle and side), perhaps with @left or @right.
 CROP = re.compile(r"(.+)@(-?[\d.]+),(-?[\d.]+),([\d.]+)(?:@left|@right)?")
-_TURNS = 0, 1, 2, 0, 0  # parts (`part_of`) in the order in which files get them, and regions along a row
-_REGIONS = 10  # along the longer side of a map
+_TURNS = 0, 1, 2, 0, 0  # parts (`part_of`) of files 0 to 4, then of 5 to 9 and so on; also of regions along a row
+_REGIONS = 10  # square regions along the longer side of the box around a map's lanes or starts
 
 
 def roads_of(name: str) -> list[str]:
-    """The roads that a scenario's name lists, separated by commas. A CROP has commas, too, as may a file's name."""
+    """The roads that a scenario's name lists, separated by commas.
+
+    The commas of a CROP separate nothing, nor do those of a name that as a whole is an existing path.
+    """
     words, roads = [name] if os.path.exists(name) else name.split(","), list[str]()
     while words:
         n = 3 if CROP.fullmatch(",".join(words[:3])) else 1
@@ -63,15 +66,22 @@ def road_of(name: str, seed: int) -> tuple[str, int]:
 
 
 def is_map_file(name: str) -> bool:
-    """Whether a scenario's name is a path: of a map file, of a folder of them, or a pattern such as maps/*.osm."""
+    """Whether a scenario's name is one road, given by a path: of a file, of a folder, or a pattern such as maps/*.osm.
+
+    Any name with a dot or a separator of folders counts as a path; the file need not exist.
+    """
     return len(roads_of(name)) == 1 and (names_file(name) or glob.has_magic(name) or os.path.isdir(name))
 
 
 def files_of(name: str) -> list[str]:
-    """The map files of a path, in order. Raises: GridSimError for a folder or a pattern with fewer than three."""
+    """The map files of a path, sorted: the file itself, all that match a pattern, or those of a folder.
+
+    A folder's pictures count only if no YAML file is there. Raises: GridSimError for a folder or a pattern with fewer
+    than three.
+    """
     if os.path.isdir(name):
         files = [os.path.join(name, file) for file in sorted(os.listdir(name))]
-        kinds = ROADS + (YAMLS if any(file.endswith(YAMLS) for file in files) else PICTURES)
+        kinds = ROADS + (YAMLS if any(file.lower().endswith(YAMLS) for file in files) else PICTURES)
         files = [file for file in files if Path(file).suffix.lower() in kinds]
     elif glob.has_magic(name) and not os.path.exists(name):
         files = sorted(glob.glob(name))
@@ -86,7 +96,10 @@ def files_of(name: str) -> list[str]:
 
 
 def divided(name: str) -> list[list[str]]:
-    """The map files of a path, a list for each part: the same whatever a run's seed, so that runs can be compared."""
+    """The map files of a path, a list for each part; a single file is in all three.
+
+    The lists do not depend on a run's seed, so that runs can be compared.
+    """
     files = files_of(name)
     if len(files) == 1:
         return [files] * len(FIRST_SEEDS)
@@ -122,8 +135,9 @@ def file_of(name: str, seed: int) -> str:
 
 @lru_cache(maxsize=16)
 def with_seed(road_map: Map, seed: int, alone: bool) -> Map:
-    """The map of a file for a seed; if the file is not one of several, episodes begin in regions of the seed's part.
+    """The map of a file for a seed.
 
+    If its road has no other file (`alone`), episodes begin in regions of the seed's part.
     On a map so small that a part would have no region, they begin anywhere, for all parts.
     """
     regions = _regions(road_map) if alone else None

@@ -64,7 +64,10 @@ def has_lanes(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Raises: GridSimError if a road is neither in the registry nor a map file, or if two have the same label."""
+    """Raises: GridSimError if a road is neither in the registry nor a path, or if two have the same label.
+
+    A path (`is_map_file`) need not exist. `all` must be spelt out (`full_name`).
+    """
     roads = roads_of(name)
     if not all(roads):
         raise GridSimError(f"scenario {name!r}: the name of a road is empty")
@@ -106,10 +109,10 @@ def traffic_on(name: str, asked: Traffic | None = None, config: SimConfig | None
     """The number of other cars on a road, if a number, `usual`, `heavy` or None (the default) is asked for.
 
     Unless `asked` is a number, there are none on a map without lanes, or if cars are small (`SimConfig.unit` below 1).
-    Raises: GridSimError for another word.
+    Raises: GridSimError for anything else.
     """
-    if type(asked) is int:
-        return asked
+    if isinstance(asked, (int, np.integer)) and not isinstance(asked, bool):
+        return int(asked)
     if asked not in (None, *AMOUNTS):
         raise GridSimError(f"traffic is {', '.join(AMOUNTS)} or a number of cars, not {asked!r}")
     if not has_lanes(name) or (config is not None and config.unit < 1.0):
@@ -145,8 +148,8 @@ def _interval_of_files(name: str, _digest: str, config: SimConfig) -> tuple[floa
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`), and the road
-    has no lights.
+    For a small car, all lengths of a generated road are multiplied by the car's unit (`SimConfig.unit`), its speeds by
+    `SimConfig.pace`, and the road has no lights.
     """
     config = config or SimConfig()
     check_name(name)

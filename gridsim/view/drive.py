@@ -1,7 +1,7 @@
 """Manual driving: a person drives in a window; drives are recorded as CSV files, read and replayed.
 
-A row is a control step: the car's state, and the action taken. So a file is a list of (state, action) pairs to learn
-from. Replaying its actions gives the same poses, bit for bit.
+A row is a control step: the car's pose before it, and the action taken. So a file is a list of (state, action) pairs
+to learn from. Replaying its actions gives the same poses, bit for bit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _POSE = ("x_m", "y_m", "heading_rad", "speed_mps", "steering_rad")
 COLUMNS = ("time_s", *_POSE, "action", "episode", "traffic", "scenario", "map_seed", "sim")
 MAX_TRAFFIC = 1000  # other cars in a recorded drive that is read, at most
 LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: the most that is read in a pose, either sign
-FPS = 30  # pictures a second in the window
+FPS = 30  # pictures a second in the window, roughly; but at least one for each control step
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
 _ENDLESS = 10_000_000  # control steps
 _PATIENCE = 1e6  # s
@@ -39,7 +39,10 @@ HELP = "arrows drive   space brakes   R restarts   Esc ends"
 
 @dataclass(frozen=True)
 class Drive:
-    """A recorded drive: n control steps on one map; map and episode determine where the other cars begin."""
+    """A recorded drive: n control steps on one map.
+
+    The map, the episode and its first pose determine where the other cars begin.
+    """
 
     scenario: str
     map_seed: int
@@ -60,7 +63,7 @@ def manual(config: SimConfig, traffic: int = 0) -> Simulator:
 
 
 def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> None:
-    """Begin an episode at start float32 [5], in traffic that follows from the map's seed and the episode's number."""
+    """Begin an episode at start float32 [5], in traffic drawn with the map's seed and the episode's number."""
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
     worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
     simulator.reset(road_map, start[None], worlds=worlds)
@@ -69,7 +72,8 @@ def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int)
 def action_for(keys: set[str], speed: float) -> Action:
     """The action for the held keys (named as in "up"), at a speed in m/s.
 
-    Braking has priority, left and right cancel each other, and down reverses once the car stands.
+    Braking and reversing exclude steering. Space brakes; down brakes, and reverses once the car stands. Left and right
+    cancel each other.
     """
     if "space" in keys or ("down" in keys and speed > STANDING):
         return Action.BRAKE
@@ -99,7 +103,10 @@ class Recorder:
         self._writer.writerow(COLUMNS)
 
     def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
-        """Write one row: control steps since the episode's start; pose float32 [5]. Raises GridSimError."""
+        """Write one row: an action, and the control steps since the episode's start and the pose float32 [5] before it.
+
+        Raises: GridSimError.
+        """
         # Nine digits represent a float32 exactly.
         numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
         try:
@@ -190,10 +197,6 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds
 
 
-def _present(world: np.ndarray) -> np.ndarray:
-    return world[world[:, LANE] >= 0.0]  # a copy
-
-
 def drive(
     road_map: Map,
     start: np.ndarray,
@@ -203,7 +206,7 @@ def drive(
     seconds: float = math.inf,
     traffic: int = 0,
 ) -> dict[str, float]:
-    """Let a person drive in real time until the window is closed, or for `seconds` of simulated time.
+    """Let a person drive in real time until Esc, Q or the window's closing, or for `seconds` of simulated time.
 
     Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them. Raises: GridSimError.
@@ -224,7 +227,7 @@ def drive(
                 episode += 1
             _begin(simulator, road_map, start, episode)
             path = [start[:2].copy()]
-        before, view, there = simulator.cars[0].copy(), simulator.ranges[0].copy(), _present(simulator.worlds[0])
+        before, view, there = simulator.cars[0].copy(), simulator.ranges[0].copy(), simulator.worlds[0].copy()
         ended = simulator.ends[0] != End.RUNNING
         if not ended:
             step = int(before[STEPS])
@@ -233,7 +236,8 @@ def drive(
                 recorder.write(step, start if step == 0 else poses_of(before), action, episode)
             simulator.step(np.array([int(action)]))
             steps += 1
-        after, then = simulator.cars[0], _present(simulator.worlds[0])
+        after, then = simulator.cars[0], simulator.worlds[0]
+        present = then[:, LANE] >= 0.0  # traffic may have taken a car away (`config.GRIDLOCK`)
         best = max(best, float(after[DISTANCE]))
         for k in range(1, pictures + 1):
             part = k / pictures
@@ -243,7 +247,7 @@ def drive(
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
             image = renderer.draw(
-                car, boxes=interpolate(there, then, part, road_map),
+                car, boxes=interpolate(there[present], then[present], part, road_map),
                 ranges=view + np.float32(part) * (simulator.ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
             window.show(image, pictures / period)

@@ -11,6 +11,7 @@ import gridsim
 from cluster import api, evaluator
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.commands.cli import evolve_main
+from cluster.learn.evolution import Evolution
 from cluster.store.champion import held_out
 from cluster.store.checkpoint import CheckpointError, save
 from cluster.store.checkpoint import load as load_checkpoint
@@ -148,7 +149,11 @@ def test_own_fitness_decides(champion):
     assert {"distance", "paced", "steps", "end"} <= set(seen[0][0])
     assert seen[0][1][0] == 32
     assert len(history) == 2
+    assert set(history[-1]) == set(Evolution.columns)
+    assert history[-1]["wall_s"] > history[0]["wall_s"] > 0.0
     assert history[-1]["fitness/best"] < 0
+    with pytest.raises(GridSimError, match="give settings, or population by name"):
+        evolve(SMALL, population=8)
     assert other.genome.tobytes() != champion.genome.tobytes()
 
 

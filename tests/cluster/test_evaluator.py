@@ -75,6 +75,12 @@ def test_wrong_use_is_said_in_one_line(given: dict, said: str) -> None:
         gridsim.Evaluator(**given)
 
 
+@pytest.mark.parametrize("sim", ["f1tenth", SimConfig.load("f1tenth")])
+def test_a_small_car_has_no_traffic_by_default(sim: SimConfig | str) -> None:
+    with gridsim.Evaluator("highway", policy="mlp:8", sim=sim, episodes=1) as evaluator:
+        assert evaluator.evaluate(np.zeros((1, evaluator.genes), dtype=np.float32)).shape == (1, 1)
+
+
 def test_genomes_that_do_not_fit_are_refused() -> None:
     with gridsim.Evaluator("curved", policy="mlp:8") as evaluator:
         for wrong in (np.zeros((2, 5)), np.zeros(evaluator.genes)):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tracked import PYTHONPATH, client, free_port, mlflow_server, tracking, write_run
 
 from cluster.redaction import one_line, redacted
-from cluster.tracking.address import check_uri
+from cluster.tracking.address import check_uri, with_password
 from cluster.tracking.description import read_run
 from cluster.tracking.tracking import Tracking, saved_uri
 
@@ -86,11 +86,13 @@ def test_the_folder_holds_no_secret_and_a_resumed_run_finds_it_again(tmp_path, m
     assert check_uri(begun_with=saved) == saved
     monkeypatch.setenv("MLFLOW_TRACKING_URI", whole)
     assert check_uri(begun_with=saved) == whole
+    own = "postgresql://me:mine@127.0.0.1:1/db?sslmode=require"
+    assert with_password(own) == own
 
 
 RUN = """
 from pathlib import Path
-from cluster.tracking.address import check_uri
+from cluster.tracking.address import check_uri, with_password
 from tracked import read_run, send, tracking, write_run
 run = tracking(write_run(Path("a"), 2), check_uri())
 print(run.wait_id(60))

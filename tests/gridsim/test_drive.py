@@ -23,6 +23,7 @@ from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.simulator import Simulator
 from gridsim.state import LANE, X, Y
 from gridsim.view.drive import COLUMNS, Recorder, action_for, drive, read_drive, replay
 
@@ -92,6 +93,23 @@ def test_a_drive_that_is_begun_anew_in_traffic_replays_among_the_same_cars(scena
     for k in (0, 3, 5, 9):
         assert after[k][:, [X, Y]] == pytest.approx(worlds[k + 1][worlds[k + 1][:, LANE] >= 0][:, [X, Y]], abs=1e-3)
     assert np.abs(worlds[0] - worlds[5]).max() > 1.0, "other cars than at first"
+
+
+def test_a_car_that_traffic_takes_away_is_no_longer_shown(scenario, monkeypatch):
+    """As after a minute in which the person's car blocks a junction."""
+    step = Simulator.step
+
+    def without_the_first(simulator, actions):
+        step(simulator, actions)
+        simulator.worlds[0, 0, LANE] = -1.0
+
+    monkeypatch.setattr(Simulator, "step", without_the_first)
+    shown: list[np.ndarray] = []
+    pressed = iter([set(), set(), {"q"}])
+    window: Any = SimpleNamespace(closed=False, keys=lambda: (next(pressed), {"up"}), show=lambda *_: None)
+    renderer: Any = SimpleNamespace(config=SimConfig(), draw=lambda car, boxes, **_: shown.append(boxes))
+    drive(scenario, sample_starts(scenario, 1, np.random.default_rng(0))[0], window, renderer, traffic=6)
+    assert {len(boxes) for boxes in shown} == {5}
 
 
 DAMAGES = {

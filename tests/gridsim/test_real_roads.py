@@ -394,6 +394,17 @@ def test_cache_gives_the_same_map_without_netconvert(tmp_path, monkeypatch):
     assert (label(name), traffic_on(name)) == ("a 'street'", 8)
 
 
+def test_a_damaged_cache_is_made_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(load, "CACHE_FOLDER", tmp_path)
+    name = written(tmp_path, "a.osm", osm([street((0.0, 0.0), (200.0, 0.0))]))
+    first = build(name, 0)
+    (cache,) = tmp_path.glob("road-*.npz")
+    for damaged in (b"", cache.read_bytes()[:-200]):
+        load.load.cache_clear()
+        cache.write_bytes(damaged)
+        assert pickle.dumps(build(name, 0).network) == pickle.dumps(first.network)
+
+
 def test_crop(tmp_path):
     ways = [*CROSSING, street((120.0, 0.0), (400.0, 0.0))]
     name = written(tmp_path, "long.osm", osm(ways))

@@ -8,7 +8,6 @@ import math
 import os
 import re
 import tempfile
-import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -37,20 +36,20 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips,
 from gridsim.reading import read_bytes
 
 NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
-MAX_NODES = 1 << 24  # of the field: 4 square km
-SHORTEST_SIDE = 64.0  # m; no side of the torus is shorter
+MAX_NODES = 1 << 24  # of a field, at most: those of 4 square km
+SHORTEST_SIDE = 128.0  # m, of the torus; half of it is more than a sensor's range can be
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
 SLOWEST_LIMIT = 15 / 3.6  # m/s; a lower limit must be in a wrong unit, and counts as none
 SPEEDS = 0.45, 0.95  # the speed interval, as shares of the map's median limit (weighted by length)
 SIDES = {"right": 1.0, "left": -1.0}
-FASTEST = 27.0  # m/s; the upper end of the speed interval is at most this
+FASTEST = 27.0  # m/s; the upper end of the speed interval is at most this, and the lower end is limited in proportion
 
 
 def read_road(path: Path, crop: tuple[float, float, float] | None = None, hand: float | None = None) -> RealRoad:
     """The roads of a file as it has them; with a `crop` only those in a square, given by its middle and its side (m).
 
     The middle is latitude and longitude if the file has these, else x and y in m. `hand` is the side on which traffic
-    drives: 1 right, -1 left; None: the file decides.
+    drives: 1 right, -1 left; None: `RealRoad.hand` follows from the file, or is 0 (unknown).
     """
     data = read_content(path)
     root = parse(path, data)
@@ -72,10 +71,10 @@ class Prepared:
 
     format: str
     notes: list[str]  # of `RealRoad`
-    origin: np.ndarray  # float64 [2], m: the file's coordinates of the map's lower left corner
+    origin: np.ndarray  # float64 [2], m: the map's lower left corner, in the coordinates of `RealRoad`
     nodes: np.ndarray  # clearance (m), float32 [rows, columns]; `save` rounds it to the bytes of a field
     network: Network  # `speeds`, `clear` and `room` are zeros: `make_network` computes them
-    limits: np.ndarray  # float64 [lanes], m/s
+    limits: np.ndarray  # float64 [lanes], m/s; USUAL_LIMIT where the file gives none
 
     def save(self, path: Path) -> None:
         """Write a file of plain arrays, so that loading it runs no code. It appears at `path` whole, or not at all."""
@@ -88,7 +87,7 @@ class Prepared:
 
     @classmethod
     def load(cls, path: Path) -> Prepared:
-        """Read what `save` wrote. Raises: OSError, ValueError, LookupError or BadZipFile."""
+        """Read what `save` wrote. A missing or damaged file raises whatever NumPy and zipfile raise."""
         with np.load(path, allow_pickle=False) as arrays:
             name, *notes = (str(line) for line in arrays["text"])
             nodes = arrays["field"].astype(np.float32) / F(FIELD_STEPS) + F(FIELD_FLOOR)
@@ -99,7 +98,7 @@ class Prepared:
 
 
 def hand_of(lanes: dict[str, Lane]) -> float:
-    """The side on which traffic drives: 1 right, -1 left; found from where opposite lanes lie."""
+    """The side on which traffic drives: 1 right, -1 left; found from where opposite lanes lie. 1 if there are none."""
     lines = [resampled(lane, math.ceil(lane.length / 3.0))[0] for lane in lanes.values() if not lane.junction]
     if not lines:
         return 1.0
@@ -201,7 +200,7 @@ def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, floa
 
 
 def load_road(name: str, config: SimConfig) -> Map:
-    """The map of a file of real roads, cached as long as the file does not change. Raises: GridSimError."""
+    """The map of a file of real roads; the last four are cached. Raises: GridSimError, also if config.unit < 1."""
     if config.unit < 1.0:
         raise GridSimError(f"{name}: real roads are for cars of 2.9 m or more, not of {config.vehicle.length:g} m")
     return load(os.path.abspath(name), file_digest(name), config)
@@ -214,7 +213,7 @@ def file_digest(name: str) -> str:
 
 @lru_cache(maxsize=4)
 def load(name: str, digest: str, config: SimConfig) -> Map:
-    """The map of a file with this digest."""
+    """The map of a file with this digest; a changed file has another, so that its map is built anew."""
     return map_of(name, prepared(name, digest, gap_of(config)), config)
 
 
@@ -238,10 +237,8 @@ def prepared(name: str, digest: str, gap: float) -> Prepared:
     """What `prepare` makes of a file, from the cache if it is there."""
     path, crop, hand = split_name(name)
     kept = cached(name, digest, gap)
-    try:
+    with contextlib.suppress(Exception):  # whatever a missing or damaged file raises: it is made anew
         return Prepared.load(kept)
-    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
-        pass
     try:
         made = prepare(read_road(path, crop, hand), gap)
     except GridSimError as error:
