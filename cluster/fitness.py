@@ -39,7 +39,7 @@ def give(function: Fitness) -> str:
 
 
 def forget() -> None:
-    """Forget the functions found so far, as their files may have changed."""
+    """Forget the functions found by name, so that a changed FILE.py is run again; a module stays as it was imported."""
     load.cache_clear()
     _find.cache_clear()
 
@@ -48,7 +48,8 @@ def forget() -> None:
 def load(name: str) -> Fitness:
     """The fitness function of a name. Raises: GridSimError if it cannot be found or imported.
 
-    The function that is returned checks itself: it raises GridSimError if its code fails or its scores do not fit.
+    The function that is returned checks itself: it raises GridSimError if the user's code fails, or if its scores are
+    not one number for each member or hold a nan. Infinite ones are allowed.
     """
     function = _given.get(name) or _find(name)
 
@@ -70,7 +71,10 @@ def load(name: str) -> Fitness:
 
 
 def digest(name: str) -> str:
-    """Digest of the source that a function comes from, without running any of it; "" if it cannot be found."""
+    """Digest of a named function's whole file, or of the source of one that was passed as an object.
+
+    None of it is run. The digest is "" if there is no such source.
+    """
     try:
         source = inspect.getsource(_given[name]).encode() if name in _given else _file(name).read_bytes()
     except (OSError, TypeError, ValueError):
@@ -145,7 +149,7 @@ def _place(function: Any) -> str:
 
 
 def _fault(error: Exception) -> str:
-    """An error in one line: file and line of the user's code that raised it, its type and message."""
+    """An error in one line: file and line where it was raised (also in a library), its type and message."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{Path(error.filename).name}:{error.lineno}: SyntaxError: {error.msg}"
     others = (__file__, importlib.__file__)

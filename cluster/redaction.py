@@ -18,8 +18,9 @@ _SECRET = "pass|pw|token|secret|key|cred|sig|auth|odbc_connect"  # parts of the 
 def redacted(uri: str) -> str:
     """An address without user and password, with only `_HARMLESS` query parameters; of http also without a fragment.
 
-    A password may hold an @ or a slash, so everything up to the last @ is left out. An @ behind a question mark may
-    belong to a password or to a parameter: then the address is shown as its scheme and `UNCLEAR`.
+    A password may hold an @ or a slash, so all between the scheme and the last @ is left out, except in a file's path.
+    An @ behind a question mark may belong to a password or to a parameter: then the address is shown as its scheme and
+    `UNCLEAR`.
     """
     start, rest = re.fullmatch(r"((?:[\w.+-]*:)?//|)(.*)", uri, re.DOTALL).groups()  # type: ignore[union-attr]
     head, mark, query = rest.partition("?")
@@ -37,6 +38,7 @@ def redacted(uri: str) -> str:
 def one_line(error: BaseException, uri: str = "") -> str:
     """An error in one line, without secrets; of an operating system's error (`[Errno ...]`) only the reason.
 
+    A GridSimError's text is returned as it is.
     Args: `uri` is the address that was used: the error's text may hold it, with its password.
     """
     text = str(error) or type(error).__name__

@@ -47,11 +47,11 @@ class Place:
     """Where a run is computed and logged; no champion depends on it, unless `wall_limit_s` ends the run."""
 
     workers: int = 0  # Ray workers; 0: threads of this process, or with an address a worker for each free CPU
-    address: str | None = None  # of a Ray cluster, host:port or auto
+    address: str | None = None  # of a Ray cluster, host:port or auto; None: this machine
     patience_s: float = 0.0  # how long to wait for a silent worker, or for any worker at all; 0: see `open_pool`
     uri: str = ""  # MLflow's address; "": MLflow gets nothing
     experiment: str = ""
-    wall_limit_s: float = math.inf  # wall-clock budget, including time before a resume; at least one step is done
+    wall_limit_s: float = math.inf  # wall-clock budget of learning, also before a resume; at least one step is done
 
 
 def train(
@@ -128,10 +128,11 @@ class Session:
     tracking: Tracking
     on_event: Callable[[Event], None]
     on_row: Callable[[int, dict[str, float]], None]
-    started: float  # `perf_counter` at the run's start, moved back by the time that a resumed run took before
+    # `perf_counter` at the run's start (with a limit: when learning starts), minus the s that a resumed run took before
+    started: float
     wall_limit_s: float
     initial: np.ndarray | None
-    summary: dict[str, Any] = field(default_factory=dict)  # what summary.json holds, once it is finished
+    summary: dict[str, Any] = field(default_factory=dict)  # what summary.json holds; empty until `finish`
 
     def __post_init__(self) -> None:
         settings, run = self.run.settings, self.run
@@ -148,9 +149,9 @@ class Session:
                 raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
             self.started -= learning.history[-1]["wall_s"] if learning.history else 0.0
             self._steps.write_history(rows)
-        self._state: State | None = None  # the learner's after the last step; None once that is saved
+        self._state: State | None = None  # the learner's state after the last step; None if that is saved
         self._saved_at = -math.inf
-        self._away = False  # whether an outage of MLflow was reported
+        self._away = False  # whether an outage of MLflow was reported, and its end was not
         self._roads = roads_of(settings.scenario)
         self.maps.ahead([*learning.curriculum.map_seeds[:3], *seeds_on(VALIDATION_SEEDS, len(self._roads))])
 
@@ -159,7 +160,10 @@ class Session:
         return perf_counter() - self.started
 
     def learn(self) -> None:
-        """Learn to the end, saving steps once a second (the DQN's at once) and at the end."""
+        """Learn to the end. Steps are saved while a later one waits for the workers, and at the end.
+
+        Generations are saved once a second at most, each evaluation of the DQN at once.
+        """
         learning = self.learning
         if math.isfinite(self.wall_limit_s):  # a limit is for learning alone, so that a slow start takes none of it
             self.started = perf_counter() - (learning.history[-1]["wall_s"] if learning.history else 0.0)

@@ -35,7 +35,7 @@ from gridsim.traffic.world import check_traffic
 
 MAX_TRAFFIC = 100
 MAX_STEPS = 10**15  # largest number that a flag may give for car-steps, generations, episodes and the like
-SETTLED = 40  # generation from which the search's steps shrink in traffic (`SearchConfig.settled`); measured
+SETTLED = 40  # in traffic, the search takes smaller steps from this generation on (`SearchConfig.settled`); measured
 LEAST_GROUP = 16  # members that a group should have at least, so that its best ones are good
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
@@ -99,7 +99,7 @@ class RunSettings(ABC):
 
     @abstractmethod
     def defaults(self) -> dict[str, Any]:
-        """What 0 and "" stand for in these settings."""
+        """Values, by name, that replace 0 or "" in the settings named here, when settings are made."""
 
     @property
     @abstractmethod
@@ -126,7 +126,7 @@ class RunSettings(ABC):
         return ("+limit" + "+mirrors" * any(self.crowds)) if len(self.crowds) > 1 else ""
 
     def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run: it suits its roads, the car's size, and traffic if there is any."""
+        """The curriculum of a run with these settings: it suits the roads, the car's size, and traffic, if any."""
         special = IN_TRAFFIC if any(self.crowds) else {}
         sim, roads, usual = self.simulator(), roads_of(self.scenario), CurriculumConfig(**special)
         lows = [speed_interval(road, sim)[0] for road in roads]
@@ -148,7 +148,8 @@ class RunSettings(ABC):
     def extending(self, base: RunSettings) -> Self:
         """These settings, changed for continuing a run that had the settings `base`.
 
-        If the user has raised a limit, another limit that is only a default no longer applies.
+        If the user has raised --generations, car-steps that are only the default are no limit any more; nothing else
+        changes.
         """
         return self
 
@@ -167,7 +168,7 @@ class RunSettings(ABC):
             remedy = "use --traffic 0" + (", or leave it out of --scenario" if len(roads) > 1 else "")
             raise GridSimError(f"--traffic {self.traffic}: {without[0]} has no lanes for traffic; {remedy}")
         check_traffic(max(self.crowds), sim)
-        (low, high), *_ = [speed_interval(road, sim) for road in roads]  # reads all files
+        (low, high), *_ = [speed_interval(road, sim) for road in roads]  # of the first road; reads the map files of all
         self._check_range(0, (1 << 63) - 1, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
@@ -393,7 +394,10 @@ def check_workers(workers: int, patience_s: float) -> None:
 
 
 def from_dict(kind: type[S], values: dict[str, Any]) -> S:
-    """Settings from what `dataclasses.asdict` made of them. Raises GridSimError for names or types that do not fit."""
+    """Settings from what `dataclasses.asdict` made of them, with defaults for what is missing.
+
+    Raises GridSimError for names, types or values that do not fit.
+    """
     _check_types(kind, values)
     settings = kind(**values)
     settings.check()
@@ -401,7 +405,7 @@ def from_dict(kind: type[S], values: dict[str, Any]) -> S:
 
 
 def _check_types(kind: type[RunSettings], values: Mapping[str, Any]) -> None:
-    """Raises GridSimError for names or types of settings that do not fit."""
+    """Raises GridSimError for an unknown name, a wrong type, or a word that a setting does not offer."""
     usual, hints = vars(kind()), get_type_hints(kind)
     for name, value in values.items():
         if name not in usual:

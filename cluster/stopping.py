@@ -1,7 +1,7 @@
 """Stopping is by a flag: a signal sets it, and code that takes long checks it where stopping is safe.
 
-Ctrl-C, SIGTERM and a closed terminal (SIGHUP) all mean the same: save, and end in seconds. A second signal ends the
-process at once.
+Ctrl-C, SIGTERM and a closed terminal (SIGHUP) all mean the same: save, and end in seconds. Another signal, more
+than `ONE_SIGNAL_S` after the first, ends the process at once.
 """
 
 from __future__ import annotations

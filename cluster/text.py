@@ -23,7 +23,7 @@ def km_per_collision(figures: Mapping[str, float]) -> str:
 
 
 def file_name(words: str) -> str:
-    """Words, such as a scenario's label, as the name of a file or folder: other characters become `_`."""
+    """Words, such as a scenario's label, as a file's name: all but letters, digits and `_.+=@-` becomes `_`."""
     return re.sub(r"[^\w.+=@-]", "_", words)
 
 

@@ -25,10 +25,10 @@ _REMEDY = f"set {VARIABLE} to a folder that only you can write to"
 def cache_folder(name: str) -> Path:
     """The folder `name` for compiled kernels, created if it is missing.
 
-    It lies in the first of these that only the user can write to: the folder that `GRIDSIM_CACHE_DIR` or else
-    `XDG_CACHE_HOME` names, by default `~/.cache`; a folder of the user in the temporary folder; a new folder for this
-    process and its children, removed when the process ends. A warning is given if the last one is used, or if a folder
-    that a variable names cannot be used. Raises: GridSimError if none of them can be used.
+    It lies, as `gridsim/NAME`, in the first of these where no other user can change it (`_closed`): the folder that
+    `GRIDSIM_CACHE_DIR` or else `XDG_CACHE_HOME` names, by default `~/.cache`; a folder of the user in the temporary
+    folder; a new folder for this process and its children, removed when the process ends. A warning is given if the
+    last one is used, or if a folder that a variable names cannot be used. Raises: GridSimError if none can be used.
     """
     named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     problems: list[str] = []
@@ -61,10 +61,14 @@ def _in_private() -> Path:
 
 
 def _closed(folder: Path) -> Path:
-    """The folder, created if it is missing. Raises: OSError if it is a link, or others may change what is in it."""
+    """The folder, created if it is missing.
+
+    Raises: OSError if it or a folder above it is a link or a file, belongs to another user, or can be written by
+    others, or if the user cannot write to it. Those above may belong to root, and may be sticky, like /tmp.
+    """
     user = os.geteuid()
     trusted = {user, 0, os.stat("/").st_uid}  # in a container, another user may stand for root
-    for path in (*reversed(folder.parents), folder):  # from the top: nothing is created in a folder of others
+    for path in (*reversed(folder.parents), folder):  # from the top: each is checked before the next is created
         if not os.path.lexists(path):
             with contextlib.suppress(FileExistsError):
                 path.mkdir(mode=0o700)

@@ -11,7 +11,7 @@ from gridsim.maps.network import wrapped
 from gridsim.maps.roads import THICK_WALL, clearance
 from gridsim.state import COS, LANE, SIN, SPEED, X, Y
 
-# Points on a car's outline that are checked where the road's edge has no sharp corners, as shares of the car's half
+# Points on a car's outline that are checked on maps without thin walls (`THICK_WALL`), as shares of the car's half
 # length and half width: the car's corners first.
 _OUTLINE = np.array(
     [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
@@ -19,7 +19,7 @@ _OUTLINE = np.array(
 )
 _OUTLINE.setflags(write=False)
 # Least distance (m) between points of the outline that are checked on maps with thin walls. A right-angled corner of a
-# wall that reaches into the car by less than half of it may be missed.
+# wall that reaches into the car by less than half this distance may be missed.
 _OUTLINE_STEP = F(0.1)
 
 
@@ -27,8 +27,8 @@ _OUTLINE_STEP = F(0.1)
 def _outline_leaves_road(road, length, width, x, y, cosine, sine):
     """Whether a rectangle's outline leaves the road; `length` and `width` are half its sides (m).
 
-    The check steps along each side by the clearance, but at least by `_OUTLINE_STEP`. So it also finds the corner of a
-    parked car between two corners of the rectangle.
+    The check steps along each side by the clearance, but at least by `_OUTLINE_STEP`. So it also finds a parked car's
+    corner that reaches in between two corners of the rectangle.
     """
     for _ in range(4):  # the right side from rear to front, then the others counter-clockwise
         x0, y0 = x - length * cosine + width * sine, y - length * sine - width * cosine
@@ -44,10 +44,10 @@ def _outline_leaves_road(road, length, width, x, y, cosine, sine):
 
 @leaf
 def collides(road, constants, x, y, cosine, sine):
-    """Whether any part of the car's outline is off the road.
+    """Whether a car at this pose is off the road, judged by points of its outline.
 
-    On maps with thin walls, the whole outline is checked, as exactly as the clearance field is known (at nodes 0.5
-    units apart, `SimConfig.unit`). On others, no wall has corners as sharp as a parked car's: twelve points are enough.
+    On maps with thin walls, points all along the outline are checked (`_outline_leaves_road`). On others, no wall has
+    corners as sharp as a parked car's: twelve points are enough (`_OUTLINE`).
     """
     length, width = constants.half_length, constants.half_width
     # Two circles cover the car, one for each half. If both are clear of the edge, the outline need not be checked.
@@ -70,7 +70,7 @@ def collides(road, constants, x, y, cosine, sine):
 
 @leaf
 def separation(constants, dx, dy, cosine, sine, other_cosine, other_sine):
-    """Gap (m) between two cars, the other (dx, dy) m away; negative if they overlap.
+    """Gap (m) between two cars of the same size, whose middles are (dx, dy) m apart; negative if they overlap.
 
     It is the largest gap along any of their four axes (separating axis theorem, Gottschalk et al. 1996). If two corners
     are closest, the cars are farther apart than that.
@@ -86,7 +86,7 @@ def separation(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 @leaf
 def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
-    """Whether two cars overlap, the other (dx, dy) m away."""
+    """Whether two cars overlap or touch; args as in `separation`."""
     return separation(constants, dx, dy, cosine, sine, other_cosine, other_sine) <= ZERO
 
 
@@ -104,7 +104,7 @@ def top_speed_near(world, reach, width, height, x, y):
 
 @leaf
 def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
-    """Whether a car at this pose overlaps one of a world's cars where that was `back` (0 to 1) control periods ago."""
+    """Whether a car at this pose touches one of a world's cars, each moved back by `back` (0 to 1) control periods."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO:
             behind = back * dt * world[j, SPEED]
@@ -119,7 +119,10 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
 
 @leaf
 def stands_ahead(constants, world, width, height, x, y, cosine, sine):
-    """Whether one of a world's cars stands in the way of a car, less than `courtesy` m ahead of that car's front."""
+    """Whether a standing car of a world is in front of a car at this pose.
+
+    It counts if it is slower than 0.5 m/s and straight ahead, with a gap of less than `courtesy` m.
+    """
     for j in range(world.shape[0]):
         if world[j, LANE] >= ZERO and world[j, SPEED] < HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)

@@ -22,7 +22,7 @@ from gridsim.state import POSE
 
 _F = np.float32
 
-FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none; see `SimConfig.file_speeds`
+FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none, before `SimConfig.file_speeds` scales it
 SUBSTEP = _F(1.0)  # units (`SimConfig.unit`) that a car moves between two collision checks, at most
 REENTRY = _F(12.0)  # units driven within which a car that returns to a visit cell is still on the same visit
 
@@ -37,7 +37,7 @@ LANE_CHANGE_PERIOD = 1.0  # s between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
 # m sideways per (m ahead)^2: tolerance for bends, as lanes are taken to be straight when the ego car's lane is judged
 NEIGHBOUR_WIDENING = _F(0.004)
-# A car looks ahead by the jam distance + LOOK_AHEAD m + its way in LOOK_AHEAD_TIME s + its braking distance.
+# A car looks ahead by `jam` + LOOK_AHEAD m + its way in LOOK_AHEAD_TIME s + its braking distance at `comfort` m/s2.
 LOOK_AHEAD, LOOK_AHEAD_TIME = _F(8.0), _F(1.5)
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 STOP_LINE_GAP = _F(0.25)  # m between a waiting car and the stop line; small, so that its rear clears a junction behind
@@ -57,11 +57,11 @@ FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
 EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car is taken to be able to stop before a predicted collision
 
 # Junctions.
-STANDING = _F(0.1)  # m/s below which a car stands
+STANDING = _F(0.1)  # m/s below which a car in a junction stands, for GRIDLOCK
 GRIDLOCK = _F(60.0)  # s that a car stands in a junction before it is taken away (SUMO's time-to-teleport is 300)
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
 PRIORITY_TIME = _F(4.0)  # s; a car gives way to cars with priority that would arrive less than this after its entry
-EGO_CLEARANCE = _F(7.0)  # m; no car enters a junction on a lane that comes this close to the ego car
+EGO_CLEARANCE = _F(7.0)  # m; cars do not enter a junction on a lane this close to the ego car (exceptions: `may_enter`)
 EGO_BEHIND = _F(2.5)  # m to the side within which an ego car behind a car is taken to follow it
 EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
 EGO_SECTOR_COSINE = _F(0.6)  # cosine of the angle to the ego car's heading within which that car may soon be
@@ -99,7 +99,7 @@ class SensorConfig:
 
     rays: int = quantity(31, 2, 256)
     field_of_view: float = quantity(120.0, 1.0, 240.0, "degrees")  # centred on the heading
-    range: float = quantity(50.0, 1.0, 63.0, "m")  # readings are ranges / range, in [0, 1]
+    range: float = quantity(50.0, 1.0, 63.0, "m")  # an observation has ranges / `range`, in [0, 1]
     noise: float = quantity(0.0, 0.0, 10.0, "m")  # standard deviation of a reading
     noise_share: float = quantity(0.0, 0.0, 1.0)  # added to `noise`, as a share of the measured distance
     dropout: float = quantity(0.0, 0.0, 1.0)  # share of readings that are the full range, whatever is there
@@ -132,20 +132,20 @@ class TrafficConfig:
     braking: float = quantity(8.0, 1e-6, 50.0, "m/s2")  # greatest deceleration
     headway: float = quantity(1.2, 0.0, 100.0, "s")  # T of IDM
     jam: float = quantity(2.0, 0.1, 100.0, "m")  # bumper to bumper at standstill, s0 of IDM
-    lateral: float = quantity(3.0, 0.1, 50.0, "m/s2")  # lateral acceleration in bends
+    lateral: float = quantity(3.0, 0.1, 50.0, "m/s2")  # greatest lateral acceleration in bends
     politeness: float = quantity(0.2, 0.0, 10.0)  # p of MOBIL
     threshold: float = quantity(0.2, 0.0, 50.0, "m/s2")  # acceleration that a lane change must gain
-    safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # most that a lane change may make the car behind brake
+    safe_braking: float = quantity(3.0, 0.0, 50.0, "m/s2")  # most that a car or its new follower may brake for a change
     lane_change_speed: float = quantity(1.25, 0.1, 10.0, "m/s")  # sideways, at most
     verge: float = quantity(0.3, 0.0, 10.0, "m")  # from the road's edge to a car that has moved to the right, at least
     give_way: float = quantity(0.9, 0.0, 10.0, "m")  # that a car moves to the right for the ego car, at most
-    taper: float = quantity(0.1, 0.001, 1.0)  # m to the right per m driven while giving way
+    taper: float = quantity(0.1, 0.001, 1.0)  # m per m of lane, by which the room for giving way changes at most
     beside: float = quantity(0.35, 0.0, 10.0, "m")  # between the sides of cars on crossing lanes, at least
-    spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars at the start of an episode, at least
-    spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # between a car and the ego car at the start, at least
+    spawn_gap: float = quantity(14.0, 0.1, 1000.0, "m")  # between two cars' middles at an episode's start, at least
+    spawn_gap_ego: float = quantity(22.0, 0.1, 1000.0, "m")  # the same between a car and the ego car
     courtesy: float = quantity(10.0, 0.0, 1000.0, "m")  # waiting behind what stands this close is not idle
     lights: bool = True  # whether there are traffic lights, where a road has them
-    city_lights: bool = False  # whether two streets of each `city` have traffic lights
+    city_lights: bool = False  # whether two streets of each `city` have traffic lights, if `lights`
 
 
 MOST_STEPS = 65_535  # control steps of an episode, at most
@@ -165,7 +165,10 @@ class SimConfig:
     randomise: tuple[tuple[str, float, float], ...] = ()
 
     def drawn(self, start: np.ndarray) -> SimConfig:
-        """The configuration with one episode's vehicle, drawn with the episode's start float32 [5 or more] as seed."""
+        """The configuration with one episode's vehicle; the same configuration if `randomise` is empty.
+
+        The seed is the pose in the episode's start, float32 [5 or more].
+        """
         if not self.randomise:
             return self
         rng = np.random.default_rng(
@@ -193,7 +196,7 @@ class SimConfig:
 
     @classmethod
     def of(cls, values: Any) -> Self:
-        """A checked configuration from a mapping like that of a file. Raises: GridSimError."""
+        """A checked configuration from a mapping like that of a file; None is an empty one. Raises: GridSimError."""
         values = {} if values is None else values
         if not isinstance(values, Mapping):
             raise GridSimError(f"it is a mapping with {', '.join(LIMITS)}, not {shown(values)}")
@@ -218,8 +221,9 @@ class SimConfig:
     def unit(self) -> float:
         """The unit in m: 1, or for cars shorter than 2.8 m one of 1/2, 1/4, 1/8 and 1/16.
 
-        Generated roads, walls and the resolution of maps are sized in units. Roads' speeds are multiplied by the square
-        root of the unit (Froude's law); those in `vehicle` are not.
+        Generated roads, walls and the resolution of maps are sized in units. The speed intervals of generated roads,
+        and of map files that give none, are multiplied by the square root of the unit (Froude's law); speeds in
+        `vehicle` are not.
         """
         return max(2.0 ** min(round(math.log2(self.vehicle.length / LENGTH)), 0), LEAST_UNIT)
 
@@ -234,7 +238,7 @@ class SimConfig:
         return FILE_SPEEDS[0] * self.pace, FILE_SPEEDS[1] * self.pace
 
     def check(self) -> None:
-        """Raises: GridSimError for a number that is not one, is out of its limits, or does not fit the others."""
+        """Raises: GridSimError for a value that has a wrong type, is out of its limits, or does not fit the others."""
         for part, limits in LIMITS.items():
             for name, limit in limits.items():
                 value = getattr(getattr(self, part), name)
@@ -247,7 +251,7 @@ class SimConfig:
             if least > most:
                 raise GridSimError(f"randomise.{name} must be least and most, not {least:g} and {most:g}")
         for (one, *ends), (other, *others) in combinations_with_replacement(self.randomise, 2):
-            for end, other_end in product(ends, others):  # two numbers may contradict each other
+            for end, other_end in product(ends, others):  # two numbers that are drawn may contradict each other
                 changed: dict[str, Any] = {one: end, other: other_end}
                 drawn = replace(self, vehicle=replace(self.vehicle, **changed), randomise=())
                 drawn.check()
@@ -276,7 +280,7 @@ class SimConfig:
             raise GridSimError(f"episode.time_limit must be {text}, not {episode.time_limit:g}")
 
 
-#: Least and greatest value and unit of each number.
+#: (least value, greatest value, unit such as "m") of each number, by part and name: `LIMITS["vehicle"]["length"]`.
 LIMITS = {name: limits_of(part) for name, part in vars(SimConfig()).items() if dataclasses.is_dataclass(part)}
 
 
@@ -290,7 +294,7 @@ def _ranges(given: Any) -> tuple[tuple[str, float, float], ...]:
 
 
 def names_file(name: str) -> bool:
-    """Whether a name, of a scenario or a preset, is a file's path."""
+    """Whether a name, of a scenario or a preset, is meant as a file's path: it has a dot or a slash."""
     return "." in name or os.sep in name
 
 
@@ -316,7 +320,7 @@ def _preset(name: str) -> SimConfig:
 
 
 class Constants(NamedTuple):
-    """`SimConfig` as the kernels read it: SI units and radians.
+    """Numbers of `SimConfig` as kernels read them, in SI units and radians; traffic's are `traffic.behaviour.Drivers`.
 
     It is not a NumPy record, because kernels that read one run 2 to 4 % slower, though they compile a fifth faster.
     """
@@ -336,11 +340,11 @@ class Constants(NamedTuple):
     dt: np.float32  # s
     rays: np.int32
     ray_range: np.float32  # m
-    ray_first: np.float32  # rad, of the rightmost ray from the heading
-    ray_step: np.float32  # rad
+    ray_first: np.float32  # rad, angle from the heading to the rightmost ray, negative
+    ray_step: np.float32  # rad, from a ray to the next one to the left
     progress: np.float32  # m of new ground in a control step, below which a car idles
     revisit: np.float32  # m
-    patience: np.int32  # steps
+    patience: np.int32  # control steps of idling after which an episode ends
     courtesy: np.float32  # m
     contact: np.float32  # m between the middles of two cars, below which they may touch
     near: np.float32  # m from the car's middle, within which other cars matter to a control step

@@ -1,7 +1,7 @@
 """Numba's options, and the cache of compiled kernels.
 
 Numba's own on-disk cache does not notice when a function in *another* file changes. So the cache folder is named after
-a digest of all sources and library versions: any edit leads to a new folder.
+a digest of sources and versions (`kernel_digest`): any edit of them leads to a new folder.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gridsim.cache import cache_folder
 from gridsim.errors import GridSimError
 from gridsim.packages import package_folder
 
-# Packages that may contain kernels. All their files enter the digest, so that no list of files has to be maintained.
+# Packages that may contain kernels. All their Python files enter the digest: no list of files has to be maintained.
 KERNEL_PACKAGES = ("gridsim", "evolution")
 
 
@@ -40,7 +40,7 @@ def _sources() -> list[Path]:
 
 
 def kernel_digest() -> str:
-    """Digest (16 hex digits) of everything that compiled kernels depend on: sources and versions."""
+    """Digest (16 hex digits) of the sources of KERNEL_PACKAGES and versions of Python, Numba, llvmlite and NumPy."""
     digest = hashlib.sha256()
     for name in ("numba", "llvmlite", "numpy"):
         digest.update(f"{name}=={version(name)}\n".encode())
@@ -106,8 +106,9 @@ def _warn(text: str) -> None:
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:
     """`numba.njit` with this project's options: cached in `CACHE_FOLDER`, divisions without a zero check.
 
-    `fastmath` allows contraction and reordering. Results are still the same in all processes on one type of machine,
-    because they run the same compiled code.
+    Unless `options` say otherwise, `fastmath` is FAST_MATH: sums may be reordered, for example, but NaN and infinity
+    are respected. Results are still the same in all processes on one type of machine, because they run the same
+    compiled code.
     """
     if function is None:
         return lambda f: njit(f, **options)
@@ -116,7 +117,7 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     try:
         given = {"error_model": "numpy", "fastmath": FAST_MATH, "no_cfunc_wrapper": True, **options}
         kernel = numba.njit(**given)(function)
-        kernel._cache = KernelCache(function)  # as `cache=True` does with Numba's own
+        kernel._cache = KernelCache(function)  # `cache=True` would set Numba's own cache here
         return kernel
     finally:
         CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = before

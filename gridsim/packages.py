@@ -20,7 +20,7 @@ _FILES = {"cluster": "api.py", "evolution": "episodes/rollout.py"}
 
 
 def package_folder(name: str) -> Path:
-    """The folder of GridSim's package `cluster` or `evolution`, which is not imported.
+    """The folder of GridSim's package `cluster` or `evolution`, found without importing the package.
 
     Raises: GridSimError if it is missing; if a user's file hides it, the message names that.
     """

@@ -22,7 +22,10 @@ def shown(value: object) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's bytes. Pipes and devices, which may have no end, and files too large for a map are refused."""
+    """A file's bytes.
+
+    Raises: GridSimError if it cannot be read, has more than MAX_BYTES, or is a pipe or a device, which may have no end.
+    """
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise GridSimError(f"{path} is not a regular file")
@@ -48,7 +51,10 @@ def read_yaml(path: Path) -> Any:
 
 
 def number(value: Any, what: str, low: float, high: float, unit: str = "") -> float:
-    """A number within limits, also if given as text: YAML 1.1 reads 5e-2 as a string, but ROS reads it as a number."""
+    """A value as a float, also if it is text: YAML 1.1 reads 5e-2 as a string, but ROS reads it as a number.
+
+    Raises: GridSimError if it is a bool, no number, or not within the limits; `what` names it in the message.
+    """
     try:
         found = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError, OverflowError):
@@ -59,7 +65,10 @@ def number(value: Any, what: str, low: float, high: float, unit: str = "") -> fl
 
 
 def quantity(default: float, low: float, high: float, unit: str = "") -> Any:
-    """A dataclass's field for a number from `low` to `high`; if `default` and these are int, for a whole number."""
+    """A dataclass's field for a number from `low` to `high`; if `default` and these are int, for a whole number.
+
+    The dataclass itself does not check this: `SimConfig.check` does.
+    """
     return dataclasses.field(default=default, metadata={"limits": (low, high, unit)})
 
 

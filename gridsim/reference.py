@@ -34,10 +34,10 @@ def arc_length(points: np.ndarray) -> np.ndarray:
 
 
 def curvature_along(points: np.ndarray, arc: np.ndarray, window: float = WINDOW) -> np.ndarray:
-    """Curvature (1/m) at points [n, 2] of a path, from the chords of `window` / 2 m before and after each.
+    """Curvature (1/m, left positive) at points [n, 2] of a path, from the chords of `window` / 2 m before and after.
 
-    Near the path's ends, it is the curvature at the nearest point with `window` / 4 m of path on either side. `arc`
-    is the `arc_length` of the points.
+    Chords end where the path ends. Points with less than `window` / 4 m of path on one side (or a quarter of a path
+    shorter than `window`) get the curvature of the nearest point that has as much. `arc` is the points' `arc_length`.
     """
 
     def point(s: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def profile(
     """Speed (m/s) and steering (rad, left positive) of the reference along a driven path: float64 [n] each.
 
     Args: `points` [n, 2] in m, in driving order, all different, not wrapped over the torus; `interval`, the scenario's
-    speed interval, and `start_speed`, at the first point, m/s; `window` as in `curvature_along`.
+    speed interval, m/s; `start_speed`, the greatest speed at the first point, m/s; `window` as in `curvature_along`.
     """
     arc = arc_length(points)
     curvature = curvature_along(points, arc, window)
@@ -95,6 +95,7 @@ class Series(NamedTuple):
 def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     """The errors of several drives together, by name: means over the metres (trapezoidal rule) and maxima of |e|.
 
+    Besides these, the result has `reference_mps`, the reference's mean speed, and `metres`.
     In percent, errors of velocity are relative to the reference's mean speed, since its speed at a place may be 0, and
     errors of steering to the steering limit on one side, since the reference's angle is 0 on a straight.
     """
@@ -126,9 +127,10 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
     first WINDOW / 2 units, where the curvature is not known; and the last metres, where the reference might brake for
     what lies beyond.
 
-    The reference begins with the agent's speed and ignores traffic. It follows the driven path, whose curvature is
-    averaged over WINDOW units: if the agent weaves in longer waves, the reference weaves, too, but drives more slowly.
-    So the errors of both steering and speed matter. Raises: ValueError if nothing was driven.
+    The reference begins with the agent's speed (or less, in a bend) and ignores traffic. It follows the driven path,
+    whose curvature is averaged over WINDOW units: if the agent weaves in longer waves, the reference weaves, too, but
+    drives more slowly. So the errors of both steering and speed matter. The Series is empty if all is left out.
+    Raises: ValueError if nothing was driven forwards.
     """
     poses = np.asarray(poses, dtype=np.float64)
     steps = road_map.shortest(np.diff(poses[:, :2], axis=0))

@@ -72,7 +72,10 @@ def _control(simulation, i, actions, limits, ends, rewards, cars, visits, worlds
 
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, histories):
-    """Put cars `which` [k] at `starts` [k, 5 or 8] and sense. Args as in `_control_all`; `order` indexes `which`."""
+    """Put cars `which` [k] at `starts` [k, 5 or 8] and sense.
+
+    Args as in `_control_all`, but `order` holds positions in `which` and `starts`.
+    """
     for row, first, last in runs:
         simulation = _on_map(physics, row)
         for k in order[first:last]:
@@ -82,12 +85,12 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, 
 
 @njit(nogil=True)
 def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
-    """One control period of every car; a car whose episode has ended stands still.
+    """One control period of every car in `order`; a car whose episode has ended stands still.
 
-    Args: `order` int64 [n], indices of cars, sorted by map; `runs` int64 [maps, 3], for each map its row in the atlas
-    and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
-    Writes, besides the cars' state: `rewards` [n]; `seen`: ranges and closing speeds [n, rays] and observations
-    [n, values].
+    Args: `order` int64 [k], indices of cars, sorted by map; `runs` int64 [maps, 3], for each map with cars its row in
+    the atlas and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
+    Writes, for these cars: `rewards` [n]; `seen`: ranges and closing speeds [n, rays] and observations [n, values].
+    Updates `ends`, `cars`, `visits`, `worlds` and `histories`.
     """
     for row, first, last in runs:
         simulation = _on_map(physics, row)
@@ -103,11 +106,11 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Simulator:
-    """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
+    """A batch of cars, each in an episode of its own, on a map that cars may share: arrays in, arrays out.
 
     What a car does depends only on its own map, start, traffic and actions. Attributes, which steps and resets change:
         cars: float32 [n, CAR_FIELDS].
-        visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
+        visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map; -1e6 for never.
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
@@ -126,8 +129,8 @@ class Simulator:
     ):
         """Make room for `cars` cars, each with a world of `traffic` other cars.
 
-        Observations have these `features` of `sensing.observation.OPTIONAL`. `target` (m) and `max_steps` (control
-        steps) are the configuration's unless given.
+        Observations have these `features` of `sensing.observation.OPTIONAL`, and those that all have. `target` (m) and
+        `max_steps` (control steps) are the configuration's unless given.
         """
         self.config = config or SimConfig()
         episode = self.config.episode
@@ -148,7 +151,7 @@ class Simulator:
         self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self.closing = np.zeros((cars, self.config.sensors.rays * ("motion" in features)), dtype=np.float32)
         self.observations = np.zeros((cars, values), dtype=np.float32)
-        self._physics: Physics | None = None  # made when a kernel first needs it
+        self._physics: Physics | None = None  # None: made when a kernel needs it next
         self._starts = np.zeros((cars, POSE), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
         delays, rays = imperfections_of(self.config)[1], self.config.sensors.rays
@@ -215,7 +218,7 @@ class Simulator:
     def _batches(self, cars: np.ndarray | None = None) -> Iterator[tuple[Physics, np.ndarray, np.ndarray]]:
         """Split cars [k], by default all, into batches with the same physics; each randomised vehicle is a batch.
 
-        Yields: (physics, `order`, `runs`), the last two as in `_control_all`.
+        Yields: (physics, `order`, `runs`), the last two as in `_control_all`, but `order` holds positions in `cars`.
         """
         if self._physics is None:
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
@@ -229,9 +232,9 @@ class Simulator:
             yield (self._physics[0], self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
-        """Put cars [k] on maps [k]. Adds new maps to the atlas.
+        """Put cars [k] on maps [k]. If any of these is new, add them to the atlas.
 
-        If the atlas has MOST_MAPS, or this simulator only one car, maps on which there are no cars are removed then.
+        When it adds maps, and the atlas has MOST_MAPS or this simulator only one car, it removes maps without cars.
         """
         for each in set(maps):
             check_lanes(each, self.features)
@@ -273,7 +276,7 @@ def _views(simulation, cars, worlds, closing, ranges, observations):
 def views(
     scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig, features: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS].
+    """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS], without latency.
 
     Returns: ranges (m) of the rays, float32 [n, rays], and observations with these features, float32 [n, values].
     """

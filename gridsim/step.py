@@ -63,8 +63,8 @@ class Simulation(NamedTuple):
     drivers: Drivers
     fan: np.ndarray  # directions of the rays (`rays.fan`)
     model: Any  # `Parameters` of the vehicle's model
-    imperfections: Imperfections | None  # None: the sensor is perfect
-    delays: Delays | None
+    imperfections: Imperfections | None  # None: no noise, no dropout
+    delays: Delays | None  # None: nothing is late
     encoding: Encoding
 
 
@@ -92,7 +92,7 @@ def visit_cells(road: Road) -> int:
 
 @leaf
 def visit_cell(road, x, y, cosine, sine):
-    """Index of the visit cell of a car on the torus; if `Road.ways` is 2, each direction of travel has own cells."""
+    """Index of a car's visit cell on the torus; if `Road.ways` is 2, each direction of travel has cells of its own."""
     scale = _VISIT_SCALE * road.per_m
     columns = I(road.width * scale)
     rows = I(road.height * scale)
@@ -158,7 +158,7 @@ def look(simulation, car, world, ranges, closing, observation, history):
 def step(simulation, car, visits, world, acceleration, steering, target, max_steps):
     """One control step: advance in sub-steps with collision checks, count new ground, check for the end.
 
-    Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits: `target`, m of new ground, and
+    Args: acceleration m/s2 and steering rad, as of `vehicle.act`; the episode's limits: `target`, m of new ground, and
     `max_steps`, control steps.
     Returns: an End as a number.
     """

@@ -112,7 +112,8 @@ class DqnFlags:
 
 Flags = EvolveFlags | DqnFlags
 FLAGS: dict[str, Any] = {EvolveSettings.command: EvolveFlags, DqnSettings.command: DqnFlags}
-# Flags that may differ when a run is resumed: where it is computed and logged, how it is found, and its time limit.
+# Flags, apart from settings, that may differ when a run is resumed: where it is computed and logged, how it is found,
+# and its time limit.
 MAY_DIFFER = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
 MAY_DIFFER |= {"resume", "resume_if_exists", "config", "wall_time"}
 
@@ -344,7 +345,7 @@ def _evaluate() -> int:
 
 
 def _evaluate_suite(flags: EvaluateFlags) -> int:
-    """Drive the suite, print its table, and keep suite.json beside the champion."""
+    """Drive the suite, print its table (with --json its figures), and write suite.json beside the champion."""
     usual = EvaluateFlags(flags.champion, suite=True, json=flags.json)
     if other := [f.name for f in dataclasses.fields(flags) if getattr(flags, f.name) != getattr(usual, f.name)]:
         raise GridSimError(f"--suite is the same for everybody; leave out {as_flag(other[0])}")

@@ -163,9 +163,10 @@ def as_flag(name: str) -> str:
 
 
 def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
-    """Raises GridSimError if flags contradict those of the run or comparison (`what`) that is resumed.
+    """Raises GridSimError if flags contradict `before`, those of the run or comparison that is resumed.
 
-    Args: `free` fields may differ; fields that `may_grow` may be greater, where 0 means unlimited.
+    Args: `free` fields may differ; fields that `may_grow` may be greater, where 0 means unlimited; `what`, the word
+    "run" or "comparison".
     """
     for f in dataclasses.fields(before):
         new, old = getattr(flags, f.name), getattr(before, f.name)
@@ -211,7 +212,7 @@ def short_path(path: Path) -> str:
 
 
 def command_path(prog: str) -> str:
-    """One of the commands as the user would type it: with its folder if that is not on the PATH."""
+    """A command as the user would type it: with this program's folder if it lies there and that is not on the PATH."""
     folder = Path(sys.argv[0]).parent
     on_path = folder.resolve() in (Path(name).resolve() for name in os.get_exec_path())
     return prog if on_path or not (folder / prog).is_file() else short_path(folder / prog)

@@ -66,9 +66,9 @@ class CompareFlags(WorkFlags, Plan):
 
 
 QUICK = CompareFlags(seeds=1, budget="10s")
-# Flags that may differ in a resumed comparison.
+# Flags that may differ in a resumed comparison, besides a larger --seeds.
 MAY_DIFFER = ("resume", "jobs", "workers", "address", "patience", "tracking_uri", "experiment")
-WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
+WITH_RUNS = ("runs", "output", "name")  # the only flags for a comparison of finished runs
 MAX_JOBS = 256  # each takes some 500 MB on this machine
 WAIT_FOR_MLFLOW_S = 30.0  # at most, for the id of the comparison's run in MLflow, the parent of its training runs
 LOOK_S = 0.2  # between two looks at the runs' processes
@@ -158,7 +158,8 @@ def _train(
 ) -> int:  # fmt: skip
     """Train the runs `left` of `total` ones, `jobs` at a time, until a signal comes; a run that fails stops no other.
 
-    Args: `run_s`, the wall time (s) that a run may take, nan if not limited; `start`, which starts a run's process.
+    Args: `run_s`, the wall time (s) that a run may take, nan if not limited, which is used for the first ETA alone;
+    `start`, which starts a run's process.
     Returns: how many failed.
     """
     waiting, running, failed = deque(left), list[tuple[RunFolder, Child]](), 0

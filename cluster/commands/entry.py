@@ -16,7 +16,7 @@ from pathlib import Path
 
 from cluster import stopping
 
-STARTED = time.perf_counter()  # s; some 30 ms, Python's own startup, after the process started
+STARTED = time.perf_counter()  # s; some 30 ms after the process started, which Python's own startup takes
 
 
 def _enter(module: str, name: str) -> None:
@@ -59,9 +59,9 @@ def _enter(module: str, name: str) -> None:
 def _settle_environment() -> None:
     """Change environment variables with which libraries would fail. To be called before there are threads.
 
-    Settings of Matplotlib by a notebook or the user are removed, as they may keep it from being imported. A process may
-    have no HOME and a user id without a name (OpenShift, HTCondor, systemd). USER is then set to the id, and HOME to a
-    folder that does not exist, as Debian's services have it, so that nothing is written there.
+    Settings of Matplotlib by a notebook or the user are removed, as they may keep it from being imported. A user id may
+    have no name (OpenShift, HTCondor, systemd). USER is then set to the id if no variable names the user, and HOME, if
+    it is missing, to a folder that does not exist, as Debian's services have it, so that nothing is written there.
     """
     for name in ("MPLBACKEND", "MATPLOTLIBRC"):
         os.environ.pop(name, None)

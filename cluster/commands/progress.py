@@ -16,7 +16,7 @@ from cluster.learn.learning import Event
 from cluster.settings import MAX_STEPS, RunSettings
 from cluster.text import count
 
-LINE_S = 5.0  # between printed lines, if the output is no terminal
+LINE_S = 5.0  # least time between printed steps, if the output is no terminal; the last step is always printed
 WINDOW_S = 10.0  # the ETA is computed from the latest steps, which took at least this time
 BAR = 10  # characters
 
@@ -44,7 +44,7 @@ class RunDisplay(Display):
     def __init__(self, console: Console, settings: RunSettings):
         super().__init__(console)
         self._settings = settings
-        self._steps: deque[tuple[float, float]] = deque()  # of each step: end time, share of the run that was done
+        self._steps: deque[tuple[float, float]] = deque()  # of the latest steps: end time, share done by then
         self._printed, self._row = 0.0, ""
 
     def event(self, event: Event) -> None:
@@ -72,7 +72,10 @@ class RunDisplay(Display):
             self.console.print(f"{self.head}  {self.facts}  {self._row}", soft_wrap=True)
 
     def _eta(self) -> str:
-        """Time until the run reaches its limit if steps take as long as the latest ones; it may be solved before."""
+        """Add a step that ends now, and return the time until the run's limit if steps take as long as the latest ones.
+
+        The run may be solved before. The time is "-:--" until WINDOW_S after the first step, and without a limit.
+        """
         now = time.perf_counter()
         self._steps.append((now, self.share))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:

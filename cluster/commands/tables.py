@@ -15,9 +15,11 @@ def driving_table(
     crowds: Sequence[int],
     target: float,
 ) -> Table:
-    """How well a champion drives; with several roads a row for each, with the number of its other cars (`crowds`).
+    """How well a champion drives; with several roads a row for each, with its number of other cars, and one for all.
 
     An episode is a success if the champion drives `target` m without a collision.
+
+    Args: `crowds`, the number of other cars on each road.
     """
     if len(roads) == 1:
         return _one_road(title, figures, target)

@@ -36,7 +36,7 @@ def main(port: str) -> None:
     server = subprocess.Popen(
         [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
         env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"},
-        process_group=0,  # Ctrl-C reaches only this process, which then ends the whole group
+        process_group=0,  # Ctrl-C reaches only this process, which then ends the server's whole group
     )
     try:
         while server.poll() is None and unreachable(address):

@@ -46,9 +46,9 @@ HINTS: dict[type[GridSimError], str] = {
     RunError: "--generation and --follow need a run's folder",
     CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
 }
-FILM_S = 60.0  # s of a film by default
-FOLLOW_S = 20.0  # s that an elite is followed before the newest one takes its place
-LINGER_S = 1.5  # s that the last picture of a drive stays
+FILM_S = 60.0  # s of a film by default, unless it is of a recorded drive
+FOLLOW_S = 20.0  # s that an elite drives at most with --follow, before the newest one takes its place
+LINGER_S = 1.5  # s that the last picture of a drive stays in the window
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
         for k, (found, name) in enumerate(_drives(dataclasses.replace(flags, source=source), limit), 1):
             mark = str(k) if not flags.beside else of if k == 1 else f"{of} {k}"
             shown.append(Shown(f"{name} of {source}", mark, found))
-            if not _is_recording(source):  # the others drive on the same road, among as many cars
+            if not _is_recording(source):  # the sources after it drive on the same road, among as many cars
                 champion, _ = _driver(Path(source), flags)
                 road = full_name(flags.scenario or champion.scenario)
                 flags = dataclasses.replace(flags, scenario=road, traffic=_cars(champion, road, flags.seed, flags))
@@ -284,7 +284,7 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
 
 
 def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
-    """Show drives in a window until it is closed."""
+    """Show drives in a window until it is closed (also by Esc or Q), `limit` s were shown, or no drive is left."""
     fps = flags.fps or 30
     drives = _drives(flags, FOLLOW_S if flags.follow else math.inf)
     first = next(drives)  # raises errors before the window opens

@@ -1,7 +1,7 @@
-"""A comparison's plan: scenarios x learners x seeds, each a training run in a folder of its own.
+"""A comparison's plan: scenarios x learners x variants (of --grid) x seeds, each a training run in its own folder.
 
-Runs are ordered by seed first, so that a stopped comparison has results of every learner on every road. The plan is
-kept in comparison.json.
+All runs of one seed come before those of the next, so that a comparison that is stopped after the first seed has
+results of every learner on every road. The plan is kept in comparison.json.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Plan:
             object.__setattr__(self, "sim", os.path.abspath(self.sim))
 
     def check(self) -> None:
-        """Raises GridSimError, one line that says what to change."""
+        """Raises GridSimError if the plan cannot be carried out; its one line says what to change."""
         if not self.scenarios or not self.learners:
             raise GridSimError("--scenarios, --learners: name at least one of each")
         if not 1 <= self.seeds <= MAX_SEEDS:
@@ -99,7 +99,10 @@ class Plan:
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
-        """The combinations of `grid` for a learner, each as values by settings' names. Raises GridSimError."""
+        """The combinations of `grid` for a learner, each as values by settings' names; [{}] without a grid.
+
+        Raises: GridSimError.
+        """
         usual = vars(self.settings(self.scenarios[0], learner, 0))
         choices: list[list[tuple[str, Any]]] = []
         for text in self.grid:
@@ -143,7 +146,8 @@ class Plan:
 def limits(budget: str) -> tuple[int, float]:
     """Car-steps and seconds of wall time that a run may use at most; 0 for the one that is not limited.
 
-    Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises GridSimError.
+    Reads a number with a unit of CAR_STEPS or SECONDS, such as `20M`, `20,000,000` or `1.5h`: from 1 car-step or second
+    to MAX_CAR_STEPS or MAX_WALL_S. Raises GridSimError for another text.
     """
     if match := re.fullmatch(r"(\d+(?:\.\d+)?) ?([a-zA-Z]*)", re.sub(r"(?<=\d)[,_](?=\d)", "", budget)):
         amount, unit = float(match[1]), match[2]

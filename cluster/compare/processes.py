@@ -25,7 +25,9 @@ def flags_of(run: RunFolder, **more: object) -> list[str]:
 
 
 def start(run: RunFolder, flags: Mapping[str, object], environment: Mapping[str, str]) -> Child:
-    """Start the process that trains a run, or continues it if it was begun; what it prints goes to its log.
+    """Start the process that trains a run, continues it if it was begun, or if it is finished sends what MLflow lacks.
+
+    What it prints replaces the run's log.
 
     Args: `flags`, the command's flags besides the run's settings; `environment`, variables besides this process's.
     """
@@ -57,5 +59,8 @@ def _read(run: RunFolder) -> str:
 
 
 def is_sent(run: RunFolder) -> bool:
-    """Whether MLflow has all of a finished run, by its process's warnings; if not, starting it again sends the rest."""
+    """Whether MLflow has all of a finished run (or none is used): its log does not warn that something was not sent.
+
+    If the log does, starting the run again sends the rest.
+    """
     return not any("not logged to MLflow" in text for _, text in said(run))

@@ -43,13 +43,13 @@ RUN_FIGURES = (
     "success_rate", "distance_m", "speed_mps", "collision_rate", "km_per_collision", "car_steps", "wall_s",
     "training_s", "best_car_steps", "best_wall_s",
 )  # fmt: skip
-"""A run's figures: held-out drives, what it cost from start to end, how long it trained (without measuring the
-champion), and what training had cost when the final champion was bred."""
+"""A run's figures: of its held-out drives; `car_steps`, those of learning; `wall_s`, to the run's end; `training_s`, to
+the end of learning; `best_...`, car-steps and wall time to the end of the step in which the champion was found."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished training run, of a comparison or any other."""
+    """A finished training run, of a comparison or any other; in tables also a missing one, which has no figures."""
 
     folder: Path
     settings: RunSettings
@@ -67,7 +67,7 @@ def read_run(folder: Path) -> Run:
     settings, _ = read_config(folder / CONFIG)
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        held_out = {"km_per_collision": math.nan} | summary["held_out"]  # which earlier versions did not write
+        held_out = {"km_per_collision": math.nan} | summary["held_out"]  # earlier versions did not write this figure
         figures = {name: float((summary | held_out)[name]) for name in RUN_FIGURES}
         return Run(folder, settings, str(summary["champion_sha256"]), figures)
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
@@ -75,7 +75,7 @@ def read_run(folder: Path) -> Run:
 
 
 def measured(run: Run) -> Run:
-    """A run with its ERROR_FIGURES, nan if all its champion's drives are too short to compare. Raises GridSimError."""
+    """A run with its ERROR_FIGURES, nan if all drives of its champion are too short. Raises GridSimError, Stopped."""
     road, traffic = run.settings.scenario, run.settings.traffic
     champion, again = load_champion(run.folder / CHAMPION), f"--resume {as_argument(run.folder)}"
     if champion.sha256 != run.champion_sha256:

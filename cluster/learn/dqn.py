@@ -26,9 +26,9 @@ from evolution.episodes.figures import mean_speed
 EPISODE_STEPS = 256  # time limit of training episodes, in control steps; they are truncated at it
 BATCH_STEPS = 32_768  # approximate number of car-steps in a batch
 EPISODES = (64, 2048)  # least and greatest number of episodes in a batch
-WARM_UP = 20_000  # rows of replay before the first update
-SLICE = 8  # updates between two looks at the workers
-PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
+WARM_UP = 20_000  # rows of replay before the first update; the replay's capacity if that is less
+SLICE = 8  # updates between two looks at the workers, at most
+PROBE = {"rays": 512, "grid": 32}  # number of observations whose Q values are compared between evaluations
 STABLE = 3  # a run has converged after so many evaluations in a row with little change of its Q values
 
 
@@ -36,7 +36,8 @@ STABLE = 3  # a run has converged after so many evaluations in a row with little
 class Dqn(Learning):
     """One run of the DQN."""
 
-    # `mean` is over the training episodes since the previous evaluation, `best` is the network's in validation.
+    # `best` is the network's in validation; `mean` is since the previous evaluation: distance and speed of training
+    # episodes, reward of car-steps, and q, like `loss`, of updates.
     columns: ClassVar[tuple[str, ...]] = (
         "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
         "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate",
@@ -51,7 +52,7 @@ class Dqn(Learning):
     episodes: int = 0
     stable_evaluations: int = 0  # evaluations in a row with little change of the Q values
     updates_due: float = 0.0  # updates that the batches so far still require
-    mean_steps: float = 32.0  # mean length of the last batch's episodes, in control steps
+    mean_steps: float = 32.0  # mean length of the last batch's episodes, in control steps; at first a guess
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,7 +126,10 @@ class Dqn(Learning):
         return exploration(self.settings.epsilon, self.car_steps / self.settings.anneal, n)
 
     def _train(self) -> bool:
-        """Make some of the updates that the batches so far require. Returns whether any are left."""
+        """Make some of the updates that the batches so far require. Returns whether any are left.
+
+        While the replay has fewer rows than `WARM_UP`, none are made, and those required are dropped.
+        """
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
             self.updates_due = 0.0
         n = min(int(self.updates_due), SLICE)
@@ -153,7 +157,8 @@ class Dqn(Learning):
     def _change_of_values(self, updates: int) -> float:
         """Change of the Q values of fixed observations since the last evaluation, as a share of their spread.
 
-        A small change counts towards convergence only if there were updates.
+        It is 1 in the first evaluation. A small change counts towards convergence only if there were updates since the
+        last evaluation.
         Raises: FloatingPointError if weights or values are not finite.
         """
         if not len(self.probe):

@@ -1,7 +1,7 @@
 """The generation loop of the searches: ask, evaluate, tell, with one call of the pool per generation.
 
 Besides the members, the leader (the best genome known before the generation) drives longer episodes of its own and, if
-it does well, as a candidate for champion, the validation episodes.
+recent leaders did well, as a candidate for champion, the validation episodes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AHEAD = 8  # training maps are built for so many generations ahead
 class Evolution(Learning):
     """One run of a search."""
 
-    columns: ClassVar[tuple[str, ...]] = (  # `best` is the leader's
+    columns: ClassVar[tuple[str, ...]] = (  # `best` is the leader's, or without one the best member's
         "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
         "speed_mps/mean", "target_m", "leader/success_rate", "validation/success_rate", "car_steps", "wall_s",
         "car_steps_per_s",
@@ -57,7 +57,7 @@ class Evolution(Learning):
         return bool(self.settings.fitness)  # a fitness of the user's own may need these figures
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes the worst."""
+        """Scores float64 [n] of RESULT [n, e]; any that is not finite becomes -inf, the worst."""
         score = self._fitness(results, target)
         return np.where(np.isfinite(score), score, -np.inf)
 
@@ -97,7 +97,7 @@ class Evolution(Learning):
         score = self._score(results, goals)
         curriculum.learn_from_members(self.steps, [driven.results[part] for part in groups])
 
-        if leader is None:  # in the first generation, the best member takes the leader's place
+        if leader is None:  # in a first generation of random members, the best one takes the leader's place
             best = int(score.argmax())
             self.elites[self.steps] = self.search.genomes(np.array([best]))[0]
             led, led_score = results[best], float(score[best])

@@ -1,7 +1,8 @@
 """What the two learners share: the champion and how it is found, its figures, the history, the state.
 
 All decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
-returned what. (A limit of wall time ends a run earlier; the steps that it has made follow from the seed all the same.)
+returned what. (A limit of wall time ends a run earlier, and may cut its last step short; all that was done until then
+follows from the seed all the same.)
 
 A step is a generator: it yields an `Event` each time it has to wait for the workers, so that its caller can save, show
 progress and stop there.
@@ -28,7 +29,7 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 
-State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
+State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays, and plain JSON values
 
 WAIT_S = 0.2  # longest time between two looks at progress
 
@@ -51,7 +52,9 @@ class Champion:
     """The best network found so far, and its figures in the validation episodes."""
 
     genome: np.ndarray  # float32 [genes]
-    score: float = 0.0  # `Curriculum.validation_scores`; on several roads the success rate on the worst one
+    # `Curriculum.validation_scores`; on several roads the success rate on the worst one. With the user's own fitness it
+    # is `until` at most, so that the tie-break decides between those that reach it.
+    score: float = 0.0
     success_rate: float = 0.0
     # Decides between equal scores: mean distance (m); on several roads the mean score; or the user's own fitness.
     tie_break: float = 0.0
@@ -64,7 +67,7 @@ class Learning(ABC):
 
     columns: ClassVar[tuple[str, ...]]  # columns of history.csv after the step's number, named so in MLflow, too
     checkpointed: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps")
-    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved before the next step changes its arrays
+    save_every_s: ClassVar[float] = 0.0  # least s between saves; 0 where the next step changes a `state`'s arrays
 
     settings: RunSettings
     pool: WorkerPool
@@ -96,7 +99,10 @@ class Learning(ABC):
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """Counters of the run so far: its steps (under `settings.step_name`), and what `settings.ended` reads."""
+        """Counters of the run so far: its steps (under `settings.step_name`), and what `settings.ended` reads.
+
+        `solved` is not among them.
+        """
 
     @property
     def steps(self) -> int:
@@ -113,14 +119,14 @@ class Learning(ABC):
 
     @abstractmethod
     def candidate(self) -> np.ndarray | None:
-        """The network that may become champion after the last step, float32 [genes]; None before the first."""
+        """The network that may become champion after the last step, float32 [genes]; None if there is none yet."""
 
     def choose_champion(self) -> Progress:
         """Choose the champion when a run ends: if unsolved, the better of champion and last candidate on new maps.
 
-        The champion's score was the best of many on the same maps, by luck as well, so a later candidate that drives
-        better may not have reached it. This choice is not in the checkpoint: a run that is extended goes on as if it
-        had never ended. The car-steps of this choice do not count.
+        Without a champion, the candidate becomes it. The champion's score was the best of many on the same maps, by
+        luck as well, so a later candidate that drives better may not have reached it. This choice is not in the
+        checkpoint: a run that is extended goes on as if it had never ended. The car-steps of this choice do not count.
         """
         candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
         if candidate is None or self.solved or (before and np.array_equal(candidate, before.genome)):
@@ -192,7 +198,7 @@ class Learning(ABC):
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
 
     def state(self) -> State:
-        """All that an exact resume needs besides the history: arrays, and plain numbers by name."""
+        """All that an exact resume needs besides settings and history: arrays, and JSON values, by name."""
         champion, none = self.champion, np.zeros(0, dtype=np.float32)
         arrays: dict[str, np.ndarray] = {
             "tried": none if self.tried is None else self.tried,

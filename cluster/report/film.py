@@ -1,4 +1,4 @@
-"""Films: a champion's drive, recorded state by state, drawn and written as MP4 or GIF at true speed."""
+"""Films: drives, recorded state by state, are drawn and written as MP4 or GIF at true speed."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Recording:
     cars: np.ndarray  # float32 [steps + 1, CAR_FIELDS], the car's states (`gridsim.state`)
     ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
-    end: End  # how the drive ended; RUNNING if the recording was stopped first
+    end: End  # how the drive ended; RUNNING if the recording was stopped first, and for any drive by a person
     sim: SimConfig  # the simulator's parameters during the drive
-    outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], the network's outputs, if known
+    outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], a perceptron's outputs; None for other drivers
 
     @property
     def period(self) -> float:
@@ -55,7 +55,7 @@ class Recording:
 
     @cached_property
     def route(self) -> np.ndarray:
-        """Points (m) of the car's route ahead of each state: float32 [steps + 1, points, 2]; without a route, none."""
+        """Points (m) of the route ahead of each state: float32 [steps + 1, points, 2]; no points without a route."""
         return points_ahead(self.scenario, self.cars)
 
     @property
@@ -70,7 +70,7 @@ def record(
     """Record a champion's drive from `start` to the episode's end, or until `seconds` have passed.
 
     Args: `start`, a pose float32 [5], or [8] (`state.START_FIELDS`); `world` float32 [others, TRAFFIC_FIELDS], the
-    traffic at the start.
+    traffic at the start; None: no other cars.
     """
     episode, spec = champion.sim.episode, PolicySpec.parse(champion.policy)
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
@@ -93,7 +93,10 @@ def other_cars(worlds: np.ndarray) -> np.ndarray:
 
 
 def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "") -> np.ndarray:
-    """Draw a drive `seconds` after its start, interpolated between states: a picture uint8 [h, w, 3]."""
+    """Draw a drive `seconds` after its start, interpolated between states; after its end, draw the last state.
+
+    Returns: a picture uint8 [h, w, 3] with `title` in its upper left corner.
+    """
     from gridsim.view.render import interpolate  # imported here, as `write_report` needs no renderer
 
     at = min(max(seconds / drive.period, 0.0), len(drive.cars) - 1.0)
@@ -124,6 +127,7 @@ def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") ->
 def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
+    Args: `size`, (width, height) in pixels.
     Returns: the number of pictures. Raises: WriteError; a file that was there before is then kept.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")

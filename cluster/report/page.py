@@ -2,8 +2,9 @@
 
 Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel,
 one column per moment; the differences from each moment to the next are compressed. Positions are in 65,536ths of the
-map's sides and headings in 65,536ths of a turn, so that both wrap as the torus and the angle do. Lengths are in units
-(`SimConfig.unit`), but speeds in m/s and the distance driven in m.
+map's sides and headings in 65,536ths of a turn, so that both wrap as the torus and the angle do. Rays are in
+hundredths of a unit (`SimConfig.unit`), speeds in cm/s, new ground in dm, and outputs as shares of 65,535. Outside the
+table, lengths are in units and speeds in m/s.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
 def write_page(path: Path, title: str, shown: Sequence[Shown], together: bool = False) -> None:
     """Write a page of drives on one map. It begins with the last of them, or shows all of them `together`.
 
-    Raises: WriteError.
+    The map, the car's size and the sensor that it shows are those of the last drive. Raises: WriteError.
     """
     last = shown[-1].drive
     road_map, constant, unit = last.scenario.magnified(), constants(last.sim), last.sim.unit

@@ -40,7 +40,7 @@ def drawable(name: str) -> str:
 
 
 def figure_of(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and no global state, and the axes of its columns."""
+    """A figure, in inches, that needs no display and no global state, and its axes, one for each column."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")

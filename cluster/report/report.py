@@ -30,8 +30,8 @@ def write_report(
 ) -> None:
     """Write curves.png (history), trajectory.png (champion's drive) and drive.html (champion's and elites' drives).
 
-    All drives are of one episode, the last road's first one in `episodes`. Args: `history`, its rows; `elites`, the
-    network of each step, float32 [steps, genes]; `get_map`, a map by its seed; `episodes`, the held-out ones.
+    All drives are of one episode, the last road's first one in `episodes`. Args: `history`, the run's rows; `elites`,
+    the network of each step, float32 [steps, genes]; `get_map`, a map by its seed; `episodes`, the held-out ones.
     """
     path, settings, limit = run.path, run.settings, champion.sim.episode.time_limit
     row = len(episodes.rows) - len(episodes.rows) // len(settings.crowds)

@@ -25,7 +25,7 @@ class Stress(NamedTuple):
     share: bool = False  # whether levels are factors on the champion's own number
 
     def at(self, level: float, sim: SimConfig) -> SimConfig:
-        """The configuration `sim` with this number set to a level."""
+        """The configuration `sim` with this number set to a level, or if `share` to that multiple of its value."""
         part = getattr(sim, self.part)
         value = level * getattr(part, self.name) if self.share else level
         return dataclasses.replace(sim, **{self.part: dataclasses.replace(part, **{self.name: value})})
@@ -46,7 +46,7 @@ OF_MODEL = {"kinematic": KINEMATIC, "single_track": DYNAMIC}
 
 
 def stresses(champion: Champion) -> list[Stress]:
-    """What can get worse for a champion's vehicle."""
+    """What can get worse for a champion: STRESSES, and those of its vehicle's model."""
     return [*STRESSES, *OF_MODEL.get(champion.sim.vehicle.model, ())]
 
 

@@ -30,7 +30,7 @@ TRAFFIC: Traffic = "usual"
 
 
 def drive(champion: Champion) -> Iterator[tuple[str, int, np.ndarray]]:
-    """Drive the suite with the default car and sensor. Yields as `champion.drives`."""
+    """Drive the suite with the default simulator parameters, not the champion's. Yields as `drives` does."""
     return drives(champion.in_sim("default"), ALL, EPISODES, HELD_OUT_SEED, TRAFFIC)
 
 
@@ -52,7 +52,10 @@ def report(champion: Champion, driven: list[tuple[str, int, np.ndarray]]) -> dic
 
 
 def earlier(path: Path) -> dict[str, Any]:
-    """NUMBER, champion's digest and drives' digest from a suite.json; {} if there is none. Raises: CheckpointError."""
+    """A suite.json's number of the suite, champion's digest and drives' digest; {} if there is no such file.
+
+    Raises: CheckpointError if it cannot be read.
+    """
     try:
         found = json.loads(path.read_bytes())
         return {name: found[name] for name in ("suite", "champion_sha256", "digest")}
@@ -63,7 +66,7 @@ def earlier(path: Path) -> dict[str, Any]:
 
 
 def compared(before: dict[str, Any], found: dict[str, Any]) -> str:
-    """Whether an earlier suite.json had the same drives, in words; "" if it is of another champion or suite."""
+    """Whether an earlier suite.json had the same drives, in words; "" without one of this champion and NUMBER."""
     if any(before.get(name) != found[name] for name in ("suite", "champion_sha256")):
         return ""
     if before["digest"] == found["digest"]:

@@ -30,7 +30,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, roads_of, seed_of_map
 from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name
 
-SIM_FORMAT = 2  # of a champion's `sim`; format 1 had patience in control steps, and progress in m per control step
+SIM_FORMAT = 2  # of `sim` in a champion.npz; format 1 has patience in control steps, progress in m per control step
 GONE = ("apart", "kerb")  # traffic parameters of format 1 that no longer exist
 
 
@@ -41,8 +41,8 @@ class Champion:
     genome: np.ndarray  #: float32 [genes]
     policy: str  #: its network, such as `mlp:6,7`
     scenario: str  #: where it learned
-    sim: SimConfig  #: the simulator's parameters it learned with
-    traffic: Traffic = 0  #: other cars that it learned among: a number, or `usual` or `heavy`, which differ by road
+    sim: SimConfig  #: the simulator's parameters: those it learned with, unless they were replaced (`in_sim`)
+    traffic: Traffic = 0  #: its run's traffic: a number, `usual` or `heavy` (which differ by road); doubled in training
 
     def __repr__(self) -> str:
         return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
@@ -61,7 +61,10 @@ class Champion:
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
 
     def in_sim(self, sim: SimConfig | str | None) -> Champion:
-        """The champion with other simulator parameters (as for `SimConfig.load`), if given. Raises GridSimError."""
+        """The champion with the parameters that `SimConfig.load` makes of `sim`; itself if `sim` is None or "".
+
+        Raises: GridSimError if the parameters are invalid, or if their rays do not fit the network.
+        """
         other = dataclasses.replace(self, sim=SimConfig.load(sim)) if sim else self
         rollout.policy_buffers(PolicySpec.parse(self.policy), other.sim)  # raises if the rays do not fit the network
         return other
@@ -69,21 +72,22 @@ class Champion:
     def crowds_on(self, scenario: str, asked: Traffic | None = None) -> tuple[int, ...]:
         """The number of other cars on each road of a scenario.
 
-        By default as many as the champion learned among, if it learned on all of these roads and its present car has
-        the usual size (`SimConfig.unit` is 1); else the scenario's default.
+        `asked` is a number, `usual` or `heavy`. None means the champion's own `traffic`, if it learned on all of these
+        roads and its present car is not a small one (`SimConfig.unit` is 1); else the scenario's default.
         """
         if asked is None and self.sim.unit == 1.0 and {*roads_of(scenario)} <= {*roads_of(self.scenario)}:
             asked = self.traffic
         return crowds(scenario, asked, self.sim)
 
     def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> Any:
-        """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
+        """The action for an observation as `make_env`'s environment gives it, or an array of n for n of them.
 
-        An action is an integer (`vehicle.Action`), or for a continuous policy float32 [2]: pedal and wheel, each in
-        [-1, 1].
+        An action is an integer (`vehicle.Action`; -1 if an output of the network is NaN), or for a continuous policy
+        float32 [2]: pedal and wheel, each in [-1, 1].
 
-        Args: with rays, float32 [32] or [n, 32], or more numbers if the policy sees more; with the grid, a dictionary:
-        grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed, float32 [1] or [n, 1].
+        Args: `observation`, for a policy on rays float32 [32] or [n, 32], or more numbers if the policy sees more; on
+        the grid a dictionary: grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed, float32 [1] or [n, 1], as
+        a share of `vehicle.speed_limit`.
         Raises: ValueError, with a one-line message, for an observation that does not fit this champion.
         """
         spec = PolicySpec.parse(self.policy)
@@ -98,7 +102,10 @@ class Champion:
         return act_on(spec, self.genome, np.asarray(observation), self.sim)
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
-        """A Gymnasium environment on the champion's scenario, or another."""
+        """A Gymnasium environment (`GridSimEnv`) that suits the champion, on its scenario or another.
+
+        `options` are further arguments of the environment; they override those that the champion decides.
+        """
         from gridsim.envs.env import GridSimEnv
 
         scenario = full_name(scenario or self.scenario)
@@ -130,7 +137,8 @@ class UnfinishedError(CheckpointError):
 def load_champion(path: str | os.PathLike[str]) -> Champion:
     """Read a champion.npz, given the file or its run's folder.
 
-    Raises: UnfinishedError for a run without one, CheckpointError for a file that is missing or not a champion.
+    Raises: UnfinishedError for a run that has none yet, or RunError if its config.json is not usable either;
+    CheckpointError for any other file or folder that is missing or holds no champion.
     """
     path = Path(path)
     if os.path.isdir(path):  # path.is_dir() raises for a name that is too long
@@ -159,7 +167,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
 
 
 def _in_seconds(sim: dict[str, Any]) -> dict[str, Any]:
-    """Convert a champion's `sim` of format 1 to SIM_FORMAT: patience in s, progress in m/s, and no parameters GONE."""
+    """Convert a champion's `sim` of format 1 to SIM_FORMAT: patience in s, progress in m/s, traffic without GONE."""
     episode, period = sim["episode"], sim["episode"]["control_period"]
     episode = episode | {"patience": episode["patience"] * period, "progress": episode["progress"] / period}
     traffic = {name: value for name, value in sim.get("traffic", {}).items() if name not in GONE}
@@ -188,11 +196,11 @@ def evaluate(
     """Drive a champion through episodes, by default held-out ones, in this process.
 
     Args: `scenario`, a name (default: the champion's own), also of several roads; `episodes` on each road; `seed` of
-    the first map; `traffic`, other cars, usual, heavy or a number (default: as many as it learned among, or as another
-    scenario has by default); `sim`, what `SimConfig.load` takes (default: the simulator's numbers it learned with).
-    Returns: the number of episodes; success_rate, distance_m, speed_mps and collision_rate, which are means;
-    km_per_collision. With the defaults these are the held-out figures of summary.json.
-    Raises: GridSimError (a ValueError) for an unknown scenario or fewer than one episode.
+    the first map; `traffic`, other cars, usual, heavy or a number (default: as in `Champion.crowds_on`); `sim`, what
+    `SimConfig.load` takes (default: the champion's own `sim`).
+    Returns: figures of all roads' episodes together: `episodes`, their number; success_rate, distance_m, speed_mps and
+    collision_rate, which are means; km_per_collision. With the defaults these are the held-out figures of summary.json.
+    Raises: GridSimError (a ValueError), for example for an unknown scenario or fewer than one episode.
     """
     champion = champion.in_sim(sim)
     found = [results for _, _, results in drives(champion, scenario, episodes, seed, traffic)]
@@ -211,7 +219,8 @@ def drives(
 def held_out(
     champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: Traffic | None
 ) -> Iterator[tuple[str, int, Episodes, list[Map]]]:
-    """The episodes that `evaluate` drives. Yields for each road: its name, number of other cars, episodes and maps.
+    """The episodes that `evaluate` drives. Yields for each road: its name, number of other cars, episodes, and the
+    maps that these index.
 
     Raises: GridSimError as `evaluate` does.
     """

@@ -24,7 +24,7 @@ CONFIG, CHECKPOINT, STEPS, HISTORY = "config.json", "checkpoint.npz", "steps.bin
 MLFLOW = "mlflow.json"
 """File that says where MLflow has the run; only `cluster.tracking` reads and writes this file."""
 CHAMPION, ELITES, SUMMARY = "champion.npz", "elites.npz", "summary.json"
-"""Files of a finished run."""
+"""Files that a finished run has. If it is extended, summary.json is deleted until it is finished again."""
 
 VERSION = 1
 _MARK = b"sha256:"
@@ -56,7 +56,7 @@ def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict
 
 
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what `save` wrote: the arrays (owned, aligned, writable, C order) and the meta data.
+    """Read what `save` wrote: the arrays (in memory of their own, aligned, writable, C order) and the meta data.
 
     Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited or not GridSim's.
     """

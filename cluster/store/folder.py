@@ -46,8 +46,8 @@ class RunFolder:
     """Where a run is kept, and what it was asked to do."""
 
     path: Path
-    settings: RunSettings  # what decides its champion
-    init: str = ""  # path of the champion it started from
+    settings: RunSettings  # these, and the genome of `init` if there is one, decide its champion
+    init: str = ""  # path of the champion it started from; "": it started from random networks
     init_sha256: str = ""  # digest of that champion's genome
     saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None  # its checkpoint, if it is resumed
 
@@ -84,7 +84,10 @@ class RunFolder:
 
 
 def read_config(path: Path) -> tuple[RunSettings, str]:
-    """A run's settings, and the path of its initial champion or "", from its config.json. Raises RunError."""
+    """A run's settings, and the path of its initial champion or "", from its config.json, which is `path`.
+
+    Raises: RunError if the file is not usable, or if maps or the simulator's parameters have changed since.
+    """
     try:
         config = json.loads(path.read_bytes())
         if config["format"] != CONFIG_FORMAT:
@@ -113,7 +116,7 @@ def _sources(settings: RunSettings) -> dict[str, str]:
     return found
 
 
-@functools.cache  # a second call for a folder that is locked already does nothing
+@functools.cache  # a second call with the same path does nothing: this process has the lock
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
     try:
@@ -167,9 +170,9 @@ def new_run(
 
 
 def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> Path:
-    """The folder of a new run or comparison, checked but not yet made; by default named by `kind` and time.
+    """The folder of a new run or comparison, checked but not yet made.
 
-    Raises: RunError.
+    Args: `name`, "" to name it by `kind` and time; `may_exist` as for `new_run`. Raises: RunError.
     """
     if not name:
         name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"

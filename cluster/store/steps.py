@@ -27,7 +27,7 @@ class Steps:
     """
 
     def __init__(self, folder: Path, step_name: str, columns: Sequence[str], genes: int):
-        self.number = 0  # steps that are on the disk
+        self.number = 0  # steps that are saved; after a kill, steps.bin may hold further records, which do not count
         self._folder, self._record = folder, _record(len(columns), genes)
         self._history = [",".join([step_name, *columns])]  # lines of history.csv
 
@@ -59,7 +59,7 @@ class Steps:
         self.number += len(new)
 
     def write_history(self, rows: np.ndarray) -> None:
-        """Write history.csv anew: the earlier rows and then `rows`, float64 [n, columns]. Raises: WriteError."""
+        """Write history.csv anew: the rows of earlier calls, then `rows`, float64 [n, columns]. Raises: WriteError."""
         for row in rows.tolist():
             self._history.append(",".join([str(len(self._history) - 1), *map(repr, row)]))
         checkpoint.write_atomic(self._folder / HISTORY, "\n".join([*self._history, ""]).encode())

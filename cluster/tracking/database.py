@@ -19,7 +19,7 @@ _ENVIRONMENT = {
 
 
 def configure_mlflow() -> None:
-    """Set MLflow's environment variables, except those that the user has set.
+    """Set the environment variables of _ENVIRONMENT, except those that are set already.
 
     To be called before MLflow is imported and before there are threads.
     """
@@ -28,7 +28,7 @@ def configure_mlflow() -> None:
 
 
 def check_schema(uri: str) -> None:
-    """Raise TrackingError if another version of MLflow made the database: MLflow would migrate it without asking."""
+    """Raise TrackingError for a database that another MLflow version made: MLflow would migrate it without asking."""
     if not is_database(uri):
         return
     from mlflow.store.db import utils

@@ -30,7 +30,7 @@ NOT_LOGGED = ("target_m",)  # columns of history.csv that are not metrics
 def read_run(folder: Path) -> Content | None:
     """What MLflow is to have of a run by now; None before its first row.
 
-    Raises: GridSimError with one line if a file is damaged.
+    Raises: GridSimError with one line if a file is damaged, or if config.json is missing.
     """
     path = folder / "history.csv"
     try:
@@ -81,7 +81,10 @@ def read_rows(path: Path) -> list[tuple[int, Mapping[str, float], float]]:
 
 
 def group(settings: RunSettings) -> str:
-    """What runs that differ only in seed and limits have in common: road, learner, network and unusual settings."""
+    """Words that are the same for runs that differ only in seed and limits.
+
+    They name road, learner, network, traffic if there is any, and other settings that are not the defaults.
+    """
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [cars(settings.traffic)] if settings.traffic else []
     given = asdict(settings)
@@ -101,7 +104,10 @@ def tags(settings: RunSettings) -> dict[str, str]:
 
 
 def held_out_metrics(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The held-out figures of a summary.json by the names of MLflow's metrics; of several roads also each road's."""
+    """The held-out figures of a summary.json, except `episodes`, by the names of MLflow's metrics.
+
+    With several roads, they are followed by the same figures of each road.
+    """
     roads = {"": summary["held_out"]}
     if len(by_road := summary.get("held_out_by_road", {})) > 1:
         roads |= {f"{_plain(road)}/": figures for road, figures in by_road.items()}

@@ -71,7 +71,9 @@ class LoggedRun:
         return words + ([f"the status {status}"] if status != self._status else [])
 
     def send(self, content: Content, status: Status | None) -> str | None:
-        """Send what MLflow lacks: rows; with a status also files, model and end. If one part fails, the next is tried.
+        """Send what MLflow lacks: rows; with a status also files, model and the run's end.
+
+        If one of these fails, the next is tried, unless the server no longer answers.
 
         Returns: the last failure in one line, or None.
         """
@@ -108,7 +110,9 @@ class LoggedRun:
     def _open(self, content: Content, link: dict[str, Any]) -> None:
         """Find the run by its key or create it, add parameters and tags that it lacks, and ask MLflow what else it has.
 
-        The run is looked for in the experiment of `link`, where it was begun, and in the one that is asked for.
+        The run is looked for in the experiment of `link`, where it was begun, and in the one that is asked for. If
+        neither has it, it is created in the latter, or in the former if none is asked for. An unfinished run gets the
+        status RUNNING.
         """
         from mlflow.entities import Param, RunTag
         from mlflow.tracking import MlflowClient
@@ -137,7 +141,7 @@ class LoggedRun:
         client.log_batch(info.run_id, params=params, tags=[RunTag(*tag) for tag in new.items()])
         for name in data.metrics:
             self._steps[name] = {metric.step for metric in client.get_metric_history(info.run_id, name)}
-        if content.finished and info.status == "FINISHED" and not self._missing_rows(content):  # it is complete there
+        if content.finished and info.status == "FINISHED" and not self._missing_rows(content):  # rows and end are there
             self._status = "FINISHED"
             stored = [*client.list_artifacts(info.run_id), *client.list_artifacts(info.run_id, MODEL)]
             sizes = {path.name: path.stat().st_size for path in content.files}
@@ -276,7 +280,8 @@ class LoggedRun:
     def _end(self, content: Content, status: Status | None) -> None:
         """Add the result to the description, which a user may have edited, and end the run `wall_s` after its start.
 
-        MLflow's UI shows the time from start to end as the duration, so a training run's `wall_s` leaves out pauses.
+        Does nothing if MLflow was seen to have this status. MLflow's UI shows the time from start to end as the
+        duration, so a training run's `wall_s` leaves out pauses.
         """
         if status == self._status:
             return

@@ -1,4 +1,4 @@
-"""The process that sends a folder to MLflow, which `tracking.py` starts: `python -m cluster.tracking.sync`.
+"""The process that `tracking.py` starts to send a folder to MLflow: `python -m cluster.tracking.sync`.
 
 It syncs every few seconds: it sends what the folder has and MLflow lacks. It ends after the last sync, or as soon as
 the process that started it has ended, even if that was killed.
@@ -25,20 +25,21 @@ from cluster.tracking.address import is_database, is_locked
 from cluster.tracking.database import configure_mlflow
 from cluster.tracking.logged import LoggedRun, Status
 
-SYNC_S = 2.0  # rows that come within this time are one request: a row takes 5 ms of CPU alone, 0.8 ms among many
-RETRY_S = 5.0  # after a sync that failed
+SYNC_S = 2.0  # from a sync to the next; rows of this time share a request: 0.8 ms of CPU each, 5 ms for one alone
+RETRY_S = 5.0  # from a sync that failed to the next
 LAST_RETRY_S = 1.0  # between syncs after the run has ended
 
 
 def serve(orders: TextIO, answers: TextIO, at_eof: Callable[[], None]) -> None:
     """Sync a folder until a status comes, then once more, or twice if that fails.
 
-    While the database is locked by others, this goes on until the process is killed.
+    While others lock the database, more of these last syncs follow, until the process is killed.
 
     Args:
         orders: a line of JSON with `folder`, `uri`, `experiment`, `argv`, and `read`, the function that reads the
             folder, as "module:name"; later perhaps one with a status.
-        answers: gets lines of JSON: the ids of MLflow's run, what was sent, the last error, and what MLflow lacks.
+        answers: gets lines of JSON: the ids of MLflow's run and experiment, what was sent, the last error, and what
+            MLflow lacks.
         at_eof: is called in a thread when `orders` ends, as it does when the run's process has ended.
     """
     order, ends = json.loads(orders.readline()), SimpleQueue[Status]()

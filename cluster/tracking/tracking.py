@@ -1,8 +1,8 @@
 """Keeps MLflow up to date with a folder: what the folder has and MLflow lacks is sent until MLflow has all of it.
 
-The folder is the queue. So MLflow may be away for any time, and never stops a run or slows its learning: a separate
-process (`sync.py`) sends every few seconds and a last time at the end, and what could not be sent then is sent by a
-later `sync` of the folder. The 3 s that MLflow's import takes do not delay the run.
+The folder is the queue. So MLflow may be away for any time, and never stops a run that has begun or slows its learning:
+a separate process (`sync.py`) sends every few seconds and a last time at the end, and what could not be sent then is
+sent by a later `sync` of the folder. The 3 s that MLflow's import takes do not delay the run.
 """
 
 from __future__ import annotations
@@ -78,8 +78,9 @@ class Tracking:
         return self.run_id
 
     def close(self, status: Status) -> str | None:
-        """Sync a last time and end MLflow's run. Returns: None, or one line about what MLflow lacks.
+        """Sync a last time and end MLflow's run with this status. Returns: None, or one line about what MLflow lacks.
 
+        Without a sync, this returns None if the process was not started or the folder has nothing for MLflow yet.
         To be called when the folder is complete. Raises nothing and returns within CLOSE_S or STOP_S, whatever MLflow
         does; an unreachable server is tried once more.
         """

@@ -33,7 +33,10 @@ def cluster_address(given: str) -> str | None:
 
 
 def check_address(address: str) -> str:
-    """The address itself. Raises PoolError, within seconds, if it is not `host:port` or `auto`, or nothing answers."""
+    """The address itself. Raises PoolError, within seconds, if it is not `host:port` or `auto`, or nothing answers.
+
+    Only `host:port` is tried; `auto` is not.
+    """
     host, _, port = address.rpartition(":")
     if address != "auto" and (not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address):
         raise PoolError(f"{redacted(address)!r} is not a Ray address; give host:port (of `ray start --head`) or auto")

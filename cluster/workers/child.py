@@ -37,7 +37,7 @@ class Child:
         return self._process.poll()
 
     def is_whole(self) -> bool:
-        """Whether the command and the processes that it started all run; the latter are seen on Linux alone."""
+        """Whether the command runs and has no zombie among its children (which are seen on Linux alone)."""
         pid = self._process.pid
         with contextlib.suppress(OSError):
             for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
@@ -51,9 +51,9 @@ class Child:
         self._process.stdin.close()
 
     def close(self, patience_s: float | None) -> None:
-        """End the command, wait for it (at most `patience_s`; None: any time), and kill the rest of its session.
+        """End the command, wait for it (at most `patience_s`; None: any time), and kill what is left of its session.
 
-        May be called again.
+        That includes the command if it still runs. May be called again.
         """
         self.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):

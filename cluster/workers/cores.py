@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def cores(root: Path = Path("/")) -> int:
-    """CPU cores that this process may use, at least 1. `root` is where /proc and /sys are."""
+    """CPU cores that this process may use, rounded up, so at least 1. `root` is where /proc and /sys are."""
     least = float(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     with contextlib.suppress(OSError):  # no Linux
         for line in (root / "proc/self/cgroup").read_text().splitlines():

@@ -2,8 +2,9 @@
 
 Numba compiles one function at a time in a process. So separate processes compile what is missing in the cache on disk
 (`gridsim.jit`), from which all other processes then load it. Their command is `python -m cluster.workers.kernels PART
-SCENARIO SIM POLICY TRAFFIC COMMAND`, where PART is one of `PARTS`. `python -m cluster.workers.kernels everything`
-compiles what the learners need by default on all roads, for a container image that is to be started often.
+SCENARIO SIM POLICY TRAFFIC COMMAND [OWN]`, where PART is one of `PARTS`, and TRAFFIC a number of cars. `python -m
+cluster.workers.kernels everything` compiles what the learners need by default on all roads, for a container image that
+is to be started often.
 """
 
 from __future__ import annotations

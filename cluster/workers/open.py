@@ -12,7 +12,8 @@ def open_pool(workers: int, address: str | None, patience_s: float, build_map: B
     Args:
         workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
         address: an existing Ray cluster (`host:port` or `auto`), on which 0 workers mean one for each free CPU; None: a
-            Ray of our own, which is started on this machine.
+            Ray of our own, which is started on this machine. If this process has initialised Ray already, that is used;
+            then host:port is refused.
         patience_s: how long to go on without any Ray worker, and to wait for a silent one; 0: 300 s, but 60 s for a
             silent one in a Ray of our own.
 

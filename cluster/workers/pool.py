@@ -21,7 +21,7 @@ from gridsim.state import START_FIELDS
 
 BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; pools ask for a map repeatedly, so it keeps its maps
 
-LOOK_S = 0.1  # between two looks at whether the run is to be stopped
+LOOK_S = 0.1  # s between two looks at whether the run is to be stopped
 
 
 class PoolError(GridSimError):
@@ -50,7 +50,7 @@ class Call(ABC):
         columns = len(task.episodes)
         self.task, self.recipes = task, recipes
         self.asked = [Chunk(slice(0, rows), slice(0, columns))] if asked is None else asked
-        self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for
+        self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for or nothing has come yet
         self.warnings: list[str] = []  # a line for each worker that was replaced
         self.total, self.done = sum(map(size, self.asked)), 0  # numbers of episodes: to be driven, and driven
         self.busy_s: dict[int, float] = defaultdict(float)  # seconds of work by each worker, for statistics only
@@ -78,7 +78,7 @@ class Call(ABC):
 
     @abstractmethod
     def identify(self, piece: Chunk) -> str:
-        """A piece in words, and its first member's recipe, or episode of experience, so that it can be tried again."""
+        """A piece in words, with the numbers by which its first member, or first episode, can be tried again."""
 
 
 class Outcome(Call):
@@ -94,8 +94,8 @@ class Outcome(Call):
 
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
         super().__init__(task, recipes, asked, len(recipes))
-        # Of episodes with `rewind`: the state so many steps before the end, [episodes, START_FIELDS], and the traffic
-        # then, [episodes, cars, TRAFFIC_FIELDS]. Zero for other episodes.
+        # Of episodes with `rewind`: the state so many steps before the end (of shorter ones, at the start), [episodes,
+        # START_FIELDS], and the traffic then, [episodes, cars, TRAFFIC_FIELDS]. Zero for other episodes.
         self.rewound, self.worlds = np.zeros((len(task.episodes), START_FIELDS), np.float32), np.zeros_like(task.worlds)
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
@@ -125,7 +125,7 @@ class Collected(Call):
 
     @cached_property
     def experience(self) -> Experience:
-        """All transitions, in the order of the episodes."""
+        """All experience, in the order of the episodes. To be read only when the call is done: it is joined once."""
         return join([self._parts.pop(first) for first in sorted(self._parts)])
 
     def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
@@ -144,7 +144,7 @@ AnyCall = TypeVar("AnyCall", bound=Call)
 class WorkerPool(ABC):
     """Evaluates generations and collects experience, one call at a time.
 
-    `start` begins a call, and `wait` is then called until the call is done. Between two waits the caller may do other
+    `start` begins a call, and `wait` is then called until it returns False. Between two waits the caller may do other
     work, but only for some tens of milliseconds: a Ray worker holds two pieces, and gets more only in `wait`. A call's
     results depend on its arguments alone, never on the workers. A call that is started while another one is under way
     replaces that one. Raises: PoolError if a call cannot be done; the pool can still be used for others.
@@ -154,7 +154,7 @@ class WorkerPool(ABC):
     _call: Call | None = None  # the latest call, unless it failed; the pool does not finish earlier ones
 
     def start(self, call: AnyCall) -> AnyCall:
-        """Begin a call, and return it at once."""
+        """Begin a call, and return it without waiting for results. Its maps are built first, if they are not yet."""
         self._call = call
         self._start(call)
         return call
@@ -195,12 +195,13 @@ class WorkerPool(ABC):
 def cut(call: Call, workers: int, least_m: float, most_m: float) -> list[Chunk]:
     """Cut a call's chunks into pieces, by the metres that these may take to drive: large ones first, small ones last.
 
-    Each piece has half of one worker's share of the metres that are left, so that no worker waits long for the slowest
-    (guided self-scheduling, Polychronopoulos and Kuck 1987). A piece holds one or more members with all episodes of
-    their chunk, or one member with some of them: so all workers can share even a single member. No result depends on
-    the cut.
+    A piece has at most half of one worker's share of the metres that are left, so that no worker waits long for the
+    slowest (guided self-scheduling, Polychronopoulos and Kuck 1987), or `least_m` if that is more. It holds one or more
+    members with all episodes of their chunk, or one member with some of them: so all workers can share even a single
+    member. No result depends on the cut.
 
-    Args: `least_m` and `most_m`, metres in a piece. A metre takes a small network some microseconds at most.
+    Args: `least_m`, lowered if there are too few metres for all workers; `most_m`, metres in a piece, at most, unless
+    one episode has more. A metre takes a small network some microseconds at most.
     """
     episodes = call.task.episodes
     goals = np.maximum(np.minimum(episodes["target"], episodes["steps"]), 1).astype(np.float64)  # a step counts as 1 m

@@ -30,7 +30,7 @@ from gridsim.maps.map import Map
 # cluster. The pool goes on without any worker for LONG_PATIENCE_S at most.
 PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0
 MAX_KILLS = 3  # a call fails when so many workers have died over the same piece
-MAX_DEATHS = 8  # workers that may die in a row without an answer in between, or 3 times their number if that is more
+MAX_DEATHS = 8  # workers that may die in a row, with no answer in between; in a pool of more than 2 workers 3 for each
 QUEUED = 2  # pieces that a worker holds at once, so that it need not wait for the next one
 # Least and most metres in a piece. The largest networks need 1 ms for a metre, so less than PATIENCE_S for a piece.
 LEAST_M, MOST_M = 5_000.0, 40_000.0
@@ -81,7 +81,8 @@ class _Worker:
     # For each answer to come, oldest first: a reference to it, and its piece (None for the answer of `Actor.ready`).
     sent: deque[tuple[Any, _Piece | None]]
     pid: int = 0  # of its process; 0 until it is up
-    heard: float = field(default_factory=time.monotonic)  # last sign of life: an answer, or work sent to it while idle
+    # `time.monotonic` of its last sign of life: an answer, work sent to it while idle, or at first its creation
+    heard: float = field(default_factory=time.monotonic)
 
 
 class RayPool(WorkerPool):

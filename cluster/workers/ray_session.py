@@ -70,7 +70,10 @@ class Session:
     _head: Child | None = None
 
     def open(self, cpus: int, address: str | None, patience_s: float) -> Any:
-        """Join a cluster, or start a Ray of our own with `cpus` CPUs. Returns the module `ray`. Raises PoolError."""
+        """Join a cluster, or if `address` is None start a Ray of our own with `cpus` CPUs. Returns the module `ray`.
+
+        If this process has initialised Ray already, that is used. Raises PoolError.
+        """
         global _has_token
         ray, cure = sys.modules.get("ray"), "or evaluate in this process (workers=0)"
         if ray and getattr(ray, "is_initialized", bool)():
@@ -148,7 +151,10 @@ class Session:
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 
     def close(self) -> None:
-        """Leave Ray; if it is our own, end it and remove its folder. May be called again."""
+        """Leave Ray, unless this process used it before `open`; if it is our own, end it and remove its folder.
+
+        May be called again.
+        """
         if self._joined:
             gc.disable()  # this process would crash if a thread's collection freed a Ray reference while Ray stops
             sys.modules["ray"].shutdown()

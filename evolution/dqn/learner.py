@@ -7,8 +7,8 @@ and moves Q(s_t, a_t) towards
 
     y = r_t + discount Q_target(s_{t+1}, argmax_a Q(s_{t+1}, a))
 
-which is Double DQN (van Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning"). The loss is
-Huber's, the optimiser Adam (Kingma and Ba 2015).
+which is Double DQN (van Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning"). The discount is 0
+if step t terminated the episode. The loss is Huber's, the optimiser Adam (Kingma and Ba 2015).
 
 The result depends only on the seed, the parameters and the replay's contents, bit for bit on the CPU.
 """
@@ -35,7 +35,9 @@ from gridsim.sensing.grid import CELLS
 
 T = TypeVar("T", np.ndarray, float)
 RANDOM_SHARE = 0.02  # share of the car-steps of --anneal in which exploration falls from 1 to an episode's final share
-SPREAD = 7.0  # exploration ranges from epsilon to epsilon ** (1 + SPREAD) (alpha of Horgan et al. 2018)
+# Final exploration goes from epsilon, in a batch's first episode, to epsilon ** (1 + SPREAD), in its last (alpha of
+# Horgan et al. 2018).
+SPREAD = 7.0
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
 _adam = partial(adam, fused=True, amsgrad=False, beta1=0.9, beta2=0.999, weight_decay=0.0, maximize=False)
@@ -47,13 +49,13 @@ class DqnConfig:
 
     batch: int = 256  # transitions of an update
     learning_rate: float = 1e-3  # Adam's, at the beginning
-    final_learning_rate: float = 0.05  # Adam's at the end, as a share of `learning_rate`
+    final_learning_rate: float = 0.05  # Adam's after `learning_rate_updates`, as a share of `learning_rate`
     learning_rate_updates: int = 50_000  # updates over which the learning rate falls linearly
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target
     average: int = 2000  # time constant, in updates, of the exponential average of weights (Polyak and Juditsky 1992)
-    # Error above which the loss is linear. It is as large as returns: with 1 (Mnih et al. 2015), Q would estimate the
-    # median return, in which rare crashes have too little weight.
+    # Absolute error above which the loss is linear. It is as large as returns: with 1 (Mnih et al. 2015), Q would
+    # estimate the median return, in which rare crashes have too little weight.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
 
@@ -256,7 +258,7 @@ class DqnLearner:
 
     @one_thread()
     def train(self, replay: Replay, updates: int) -> tuple[float, float]:
-        """Make updates from a replay; n and then m of them lead to the same weights as n + m at once.
+        """Make 1 or more updates from a replay; n and then m of them lead to the same weights as n + m at once.
 
         Returns: mean loss and mean value.
         Raises: ValueError if the replay has no transitions; FloatingPointError as `update`.

@@ -26,7 +26,10 @@ def begin(car, notes):
 
 @leaf
 def note(constants, road, car, world, steps, notes):
-    """Add to `notes` the control step after the first `steps`. Accelerations derive from changed speed and heading."""
+    """Add to `notes` the control step that the car has just driven, after `steps` earlier ones.
+
+    Accelerations derive from changed speed and heading.
+    """
     per_s = ONE / constants.dt
     turned = math.atan2(
         notes[_COS] * car[SIN] - notes[_SIN] * car[COS], notes[_COS] * car[COS] + notes[_SIN] * car[SIN]

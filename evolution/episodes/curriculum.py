@@ -1,10 +1,10 @@
 """The curriculum: the episodes of each generation, and validation, which chooses the champion.
 
 Episodes begin short, since at first the best members drive into the first bend at full speed, and their length doubles
-when the leader (the best genome known before a generation) succeeds. Half of the episodes, in traffic most of them,
-start shortly before a crash of an earlier leader. There is most to learn where half of the members crash again, so such
-starts are the likeliest. Each group of members has episodes of its own, so that selection uses many although each
-member drives few. With several roads, the episodes are on each of them in turn.
+when the leader (the best genome known before a generation) succeeds. Once there are crashes, half of the episodes, in
+traffic most of them, start shortly before a crash of an earlier leader. There is most to learn where half of the
+members crash again, so such starts are the likeliest. Each group of members has episodes of its own, so that selection
+uses many although each member drives few. With several roads, the episodes are on each of them in turn.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
@@ -29,7 +29,7 @@ from gridsim.state import TERMINATES, End
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
-FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, to choose the champion when a run ends
+FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, to choose champions when runs end unsolved
 LEAST_CRASH_WEIGHT = 0.05  # floor of the weight 4p(1 - p) of a crash start, p the share of members that fail there
 
 
@@ -42,21 +42,22 @@ class CurriculumConfig:
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes for each group and generation
     crash_starts: int = 1  # short episodes for each group and generation that start before a crash of a recent leader
-    crash_target: float = 120.0  # m, target of crash starts
+    crash_target: float = 120.0  # m, target of crash starts, or the current target if that is less
     crash_memory: int = 24  # crashes that are remembered
     crowd: float = 2.0  # factor on the number of other cars in training, for more encounters over the same distance
     rewind: int = 40  # control steps from a crash start to the crash
     leader_episodes: int = 16  # episodes of the leader in each generation
     leader_stretch: float = 2.5  # target of the leader's episodes, relative to the members'
     first_target: float = 150.0  # m, target of the first episodes
-    last_target: float = 400.0  # m, largest target of training; more starts teach as much as longer episodes
-    growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
+    last_target: float = 400.0  # m, largest target of members' episodes; more starts teach as much as longer episodes
+    growth: float = 0.6  # share of the leader's episodes that must reach the members' target before it doubles
     # Of each road, m/s: mean speed that a training episode's time limit requires. The default is for `seamless`.
     pace: tuple[float, ...] = (7.0,)
     slack: float = 3.0  # s, added to the time limit that follows from `pace`
-    promising: float = 0.5  # least mean success rate of recent leaders to validate one, or the champion's if greater
+    # The leader is validated only if recent leaders' mean success rate is at least this, and at least the champion's.
+    promising: float = 0.5
     latest: int = 4  # generations whose leaders' success rates are averaged for `promising`
-    validation_share: float = 0.25  # largest share of validation in all car-steps
+    validation_share: float = 0.25  # share of validation in all car-steps, above which leaders are not validated
     validation: int = 256  # episodes of validation on each road
     champion_pace: tuple[float, ...] = (5.85,)  # of each road, m/s: mean speed below which success counts for less
 
@@ -152,7 +153,7 @@ class Curriculum:
         return Episodes(seeds, *self._starts(seeds, local, rng))
 
     def episodes(self, generation: int) -> Episodes:
-        """A generation's episodes, group by group: for each group first its new starts, then its crash starts."""
+        """A generation's episodes, group by group: for each group its new starts, then its crash starts, if any."""
         config, rng = self.config, self._rng(generation, 0)
         # If a group has too few new starts for all roads, other groups and the next generations have the other roads.
         firsts = [(generation + group) * config.starts for group in range(config.groups)]
@@ -182,7 +183,10 @@ class Curriculum:
         return rng.choice(len(weights), count, replace=count > len(weights), p=shares)
 
     def learn_from_members(self, generation: int, results: Sequence[np.ndarray]) -> None:
-        """Learn how hard the crash starts of a generation's `episodes` are, from each group's RESULT [members, e]."""
+        """Learn how hard the crash starts of a generation's `episodes` are, from each group's RESULT [members, e].
+
+        Call it before `learn_from_leader`, which changes the crashes.
+        """
         if not len(self.crashes) or not self.config.crash_starts:
             return
         chosen = self._choose_crashes(generation).reshape(len(results), -1)

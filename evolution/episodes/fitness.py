@@ -15,7 +15,7 @@ PACED_ENOUGH = 0.8  # if this share of the distance is paced, all counts as pace
 
 
 def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-    """Scalar fitness float64 [n] in [0, 1] of results [n, episodes]."""
+    """Scalar fitness float64 [n] in [0, 1] of results [n, episodes]; `target` (m) is one number or [episodes]."""
     distance = results["distance"].astype(np.float64)
     paced = np.minimum(results["paced"] / PACED_ENOUGH, distance)
     bounded = np.clip((1.0 - PACED_SHARE) * distance + PACED_SHARE * paced, 0.0, target)

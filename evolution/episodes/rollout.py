@@ -32,15 +32,15 @@ from gridsim.step import look, place, simulations_on, start_from, step, visit_ce
 _IDLE = int(End.IDLE)
 
 #: An episode: index of its map in a list of maps; start (`state.START_FIELDS`); target (m of new ground); time limit
-#: (control steps); rewind: if above 0, the state that many control steps before the end is returned.
+#: (control steps); rewind: if above 0, `evaluate` also returns the state that many control steps before the end.
 EPISODE = np.dtype(
     [("map", "<i4"), ("start", "<f4", START_FIELDS), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")]
 )
 
-#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End. Then the
-#: figures of comfort if they are asked for, else 0: mean square (m2/s4) and largest (m/s2) lateral acceleration, mean
-#: square of the jerk (m2/s6, along and across), least gap to another car (m; inf without one), and for how long (s) a
-#: car straight ahead was less than a second away.
+#: The result of an episode: new ground (m), new ground at a speed within the scenario's interval (m), control steps,
+#: End. Then the figures of comfort if they are asked for, else 0: mean square (m2/s4) and largest (m/s2) lateral
+#: acceleration, mean square of the jerk (m2/s6, along and across), least gap to another car (m; inf without one), and
+#: for how long (s) a car straight ahead was less than a second away.
 RESULT = np.dtype(
     [("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")]
     + [(name, "<f4") for name in ("lateral", "lateral_peak", "jerk", "gap", "close")]
@@ -61,7 +61,7 @@ Buffers = tuple[GridBuffers | None, np.ndarray | None]
 def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
     """A GridBuffers, or None for a policy on rays, and float32 [2] for pedal and wheel, or None for discrete actions.
 
-    Raises: GridSimError if the sensor has a wrong number of rays.
+    Raises: GridSimError if the policy is on rays and the sensor has another number of rays.
     """
     command = None if spec.actions == "discrete" else np.zeros(2, dtype=np.float32)
     if isinstance(spec, CnnSpec):
@@ -86,12 +86,12 @@ class Workspace(NamedTuple):
     car: np.ndarray  # float32 [CAR_FIELDS]
     visits: np.ndarray  # float32 [visit cells], the car's odometer (m) at its latest visit
     ranges: np.ndarray  # float32 [rays]
-    closing: np.ndarray  # float32 [rays], closing speeds of other cars, m/s; [0] if the policy does not see them
+    closing: np.ndarray  # float32 [rays], closing speeds of other cars, m/s; empty if the policy does not see them
     observation: np.ndarray  # float32 [values]
     scratch: np.ndarray  # float32, buffer of a perceptron's forward pass
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the car before each of the last n steps: step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the traffic before each of these steps, in the same rows
-    history: History | None  # None without delays of readings and commands
+    history: History | None  # None if neither readings nor commands are late
     command: np.ndarray | None  # float32 [2], pedal and wheel; None for a policy with discrete actions
 
 
@@ -168,7 +168,10 @@ def _observed_speed(simulation, observation):
 
 @leaf
 def _record(simulation, car, workspace, grid_buffers, experience, row, gained, end):
-    """Record a row's observation, and reward and end of the step before, in which the car `gained` m of new ground."""
+    """Record a row's observation and, in the row before it if there is one, the reward and end of the step between.
+
+    That step `gained` m of new ground.
+    """
     observations, actions, rewards, ends = experience
     if grid_buffers is None:
         store_rays(workspace.scratch, observations[row])
@@ -228,9 +231,9 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
 
     Args: notes, float32 [comfort.NOTES], sum up the figures of comfort; with None the result does not get these.
 
-    If an output of the network is NaN, the episode ends as IDLE, which is also recorded as the end of the last step.
-    `world`, `grid_buffers`, `recorder` and `notes` may be None. They are arguments, not fields of a record, because
-    Numba prunes `is None` branches on arguments but not on fields.
+    If an output of the network is NaN, the episode ends as IDLE, which is also recorded as the end of the last step, if
+    there was one. `world`, the traffic, changes in place. `world`, `grid_buffers`, `recorder` and `notes` may be None.
+    They are arguments, not fields of a record, because Numba prunes `is None` branches on arguments but not on fields.
     """
     car, keep = workspace.car, workspace.ring.shape[0]
     place(simulation, setup.start, car, workspace.visits)
@@ -370,7 +373,7 @@ def collect(
     config: SimConfig,
     worlds: np.ndarray,
 ) -> tuple[Experience, np.ndarray]:
-    """Drive one policy through every episode, with some random actions, and record its experience.
+    """Drive one policy (discrete actions) through every episode, some actions at random; record its experience.
 
     Args: as `evaluate`'s; `weights` float32 [spec.size]; `epsilons`, each episode's share of random actions, float32
     [e]; `keys`, the seed of each episode's random numbers, uint64 [e].
@@ -384,9 +387,9 @@ def collect(
     traffic = freeze(worlds.copy()) if worlds.shape[1] else None
     exploration = freeze(epsilons.astype(np.float32)), freeze(keys.astype(np.uint64))
     results = np.zeros(len(episodes), dtype=RESULT)
-    # Each row has room for an episode of any length.
+    # Every episode has room for the rows of the longest time limit.
     experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
-    together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # episodes that share a simulation
+    together = episodes["map"] if not config.randomise else np.arange(len(episodes))  # equal if they share a simulation
     for group in np.unique(together):
         which = np.flatnonzero(together == group)
         m = int(episodes["map"][which[0]])

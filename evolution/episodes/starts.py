@@ -22,7 +22,7 @@ class Episodes(NamedTuple):
     worlds: np.ndarray  # float32 [e, cars, TRAFFIC_FIELDS], the traffic that each begins with
 
     def and_then(self, others: Episodes) -> Episodes:
-        """Concatenate these and other episodes with the same number of cars."""
+        """Concatenate these and other episodes, whose `worlds` have places for as many cars."""
         rows = others.rows.copy()
         rows["map"] += len(self.maps)
         return Episodes(
@@ -38,11 +38,11 @@ def lane_starts(
     config: SimConfig | None = None,
     room: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes that start at rest with `traffic` other cars, the k-th uniformly over the lanes of `road_maps[maps[k]]`.
+    """Episodes in which the ego car starts at rest; the k-th start is uniform over the lanes of `road_maps[maps[k]]`.
 
-    They have the configuration's target and time limit.
+    There are `traffic` other cars around it. Episodes have the configuration's target and time limit.
     Args: `traffic`, one number for all maps or one for each; `room`, the least number of cars that the arrays have
-    places for. Cars beyond `traffic` are absent.
+    places for. Cars beyond `traffic`, and those for which lanes have no room, are absent.
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), cars, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()

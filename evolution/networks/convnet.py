@@ -43,7 +43,7 @@ class Scratch(NamedTuple):
 
     frames: np.ndarray  # [frames * 6400] cells of the frames, the newest last, in [0, 1]
     first: np.ndarray  # [19 * 19 * channels], outputs of the first convolution
-    second: np.ndarray  # [8 * 8 * channels + 1], outputs of the second convolution, then the speed
+    second: np.ndarray  # [8 * 8 * channels + 1], outputs of the second convolution, then the speed / SPEED_SCALE - 1
     dense: np.ndarray  # [units], outputs of the dense layer
     outputs: np.ndarray  # [outputs]
 
@@ -57,7 +57,10 @@ def scratch(spec: CnnSpec) -> Scratch:
 
 @leaf
 def push(grid, begun, scratch):
-    """Add a grid uint8 [6400] as newest frame, drop the oldest; if the episode has just `begun`, fill all frames."""
+    """Add a grid uint8 [6400] as newest frame and drop the oldest one.
+
+    If the episode has just `begun`, fill all frames with the grid.
+    """
     frames = scratch.frames
     older = frames.shape[0] - _AREA
     for i in range(older):

@@ -42,7 +42,7 @@ def layers_of(spec: PolicySpec, genome: Any) -> list[tuple[Any, Any]]:
 def to_onnx(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> bytes:
     """A genome float32 [genes] as an ONNX file.
 
-    The same genome always gives the same bytes. `config` gives the scales of the environment's observations.
+    The same arguments always give the same bytes. `config` gives the scales of the environment's observations.
     Raises: GridSimError without onnx, ValueError if the genome does not fit the policy.
     """
     check_extra("evolve")

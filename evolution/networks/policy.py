@@ -25,9 +25,9 @@ from gridsim.sensing.observation import OPTIONAL, encoding, normalise
 RAYS = SensorConfig.rays
 ACTIONS = 8
 MAX_GENES = 1_000_000
-COMMAND_SCALE = 0.5  # scale of the genes of the outputs pedal and wheel; with 1 both are mostly at their limits
+COMMAND_SCALE = 0.5  # scale of a perceptron's genes for pedal and wheel; with 1 both are mostly at their limits
 
-_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # matches optional features
+_FEATURES = "".join(rf"(?:\+{name})?" for name in OPTIONAL)  # matches any optional features, in OPTIONAL's order
 
 Observation = Literal["rays", "grid"]
 Actions = Literal["discrete", "continuous"]
@@ -106,10 +106,10 @@ class PolicySpec(ABC):
 
 @dataclass(frozen=True)
 class MlpSpec(PolicySpec):
-    """A multi-layer perceptron on rays, the speed, and other features: tanh hidden layers, linear outputs.
+    """A multi-layer perceptron on rays, the speed, and optional features: tanh hidden layers, linear outputs.
 
-    Other features show what a network without memory cannot infer, such as its own steering angle: the wheels take half
-    a second to turn.
+    Optional features (`features`) show what a network without memory cannot infer, such as the car's own steering
+    angle: its wheels take half a second to turn.
     """
 
     observation = "rays"
@@ -130,12 +130,12 @@ class MlpSpec(PolicySpec):
         return tuple(itertools.pairwise(self.layers.tolist()))
 
 
-# Kernels and strides of the convolutions of Mnih et al. (2015), which the paper's authors use for their grid.
+# Kernels and strides of the first two convolutions of Mnih et al. (2015), which the paper's authors use for their grid.
 KERNEL_1, STRIDE_1 = 8, 4
 KERNEL_2, STRIDE_2 = 4, 2
 SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, side of the first convolution's output
 SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8, side of the second convolution's output
-UNIT_MULTIPLE = 8  # channels and units are multiples of this, so that layers are whole vectors
+UNIT_MULTIPLE = 8  # a `cnn`'s channels and hidden units are multiples of this, so that layers are whole vectors
 
 
 @dataclass(frozen=True)
@@ -262,8 +262,8 @@ def pack(genome, layers):
 def forward(packed, layers, scratch):
     """Compute the network's outputs in `scratch`. Returns: the index at which they begin.
 
-    Args: genome packed by `pack`; scratch float32 [2 * (widest layer + 8)], which begins with the inputs.
-    A NaN anywhere reaches the outputs.
+    Args: genome packed by `pack`; scratch float32 [2 * (widest layer + 8)], which begins with the inputs and is
+    overwritten. A NaN anywhere reaches the outputs.
     """
     half = scratch.shape[0] // 2
     source, at = 0, 0
@@ -321,7 +321,7 @@ def choose(outputs, first, n, command):
 
 @leaf
 def decide(packed, layers, scratch, command):
-    """Choose a perceptron's action for the inputs in `scratch`; `command` and result are as in `choose`."""
+    """Choose a perceptron's action for the inputs in `scratch` (overwritten); `command` and result as in `choose`."""
     return choose(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1], command)
 
 

@@ -37,10 +37,11 @@ def space(spec: PolicySpec) -> Space:
 def symmetry(spec: PolicySpec) -> Symmetry:
     """The symmetry of a network in which hidden unit k of a layer is the mirror image of unit k from the layer's end.
 
-    With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
-    all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
-    The factor of a bound gene (`Symmetry.factor`) is 0 if the gene would be its own opposite, -1 if it is a gene of
-    the output that steers, that of the feature (`Feature.mirror`) for weights of a perceptron's inputs, else 1.
+    With an odd width the middle unit is its own mirror image. A hidden layer of one unit could not tell left from
+    right, so all genes of a network with such a layer are free. A `cnn` is only nearly symmetric: its second
+    convolution leaves out a column. The factor of a bound gene (`Symmetry.factor`) is 0 if the gene would be its own
+    opposite, -1 if it is a gene of the output wheel (continuous actions only), that of the feature (`Feature.mirror`)
+    for weights of a perceptron's inputs, else 1.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()

@@ -50,13 +50,14 @@ class Generation(NamedTuple):
 class Search(ABC):
     """A search by ask and tell. Random numbers depend on (seed, generation); the state is a few arrays and numbers."""
 
-    kept: ClassVar[tuple[str, ...]]  # attributes that make up the state, besides the generation
+    kept: ClassVar[tuple[str, ...]]  # attributes that make up the `state`
 
     def __init__(self, space: Space, config: SearchConfig, seed: int):
         self.space, self.config, self.seed = space, config, seed
         self.generation = 0  # completed generations
         self.asked: Generation  # the current generation
-        self.champion: np.ndarray | None = None  # of the run so far, float32 [genes]; some searches keep it as an elite
+        # The run's champion so far, float32 [genes]. The caller sets it; some searches keep it as an elite.
+        self.champion: np.ndarray | None = None
 
     @abstractmethod
     def start_from(self, genome: np.ndarray) -> None:
@@ -67,11 +68,11 @@ class Search(ABC):
         """The best genome known so far, float32 [genes], also the candidate for champion; None if there is none yet."""
 
     def state(self) -> dict[str, np.ndarray]:
-        """What an exact resume needs, besides the generation."""
+        """What an exact resume needs, besides `generation` and `champion`, which the caller keeps."""
         return {name: np.asarray(getattr(self, name)) for name in self.kept}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """The inverse of `state`."""
+        """Restore a `state`; the caller then sets `generation` and `champion`."""
         for name in self.kept:
             setattr(self, name, arrays[name] if arrays[name].ndim else arrays[name].item())
 
@@ -103,6 +104,7 @@ class Search(ABC):
 def split(members: int, groups: int, first: int = 0) -> list[slice]:
     """Split members into groups of about equal size, without splitting pairs; pairs begin after the `first` members.
 
+    The `first` members are in the first group; an odd last member counts as a pair.
     Raises: GridSimError if a group would have no pair.
     """
     pairs = (members - first + 1) // 2
@@ -114,7 +116,10 @@ def split(members: int, groups: int, first: int = 0) -> list[slice]:
 
 
 def ranks(scores: np.ndarray, groups: Sequence[slice]) -> np.ndarray:
-    """Rank of each member in its group, float64 [n] in (0, 1): share of lower scores plus half that of equal ones."""
+    """Rank of each member in its group, float64 [n] in (0, 1), the best highest.
+
+    It is the share of lower scores plus half the share of equal scores, which include the member's own.
+    """
     standing = np.empty(len(scores))
     for group in groups:
         _, place, count = np.unique(scores[group], return_inverse=True, return_counts=True)

@@ -1,7 +1,7 @@
 """Breeding: genomes from recipes, by kernels with counter-based random numbers.
 
-A recipe is a few bytes. Together with the parents and the generation's key it determines the child, bit for bit, in
-every process.
+A recipe is a few bytes. Together with the space and the generation's parents, key and mutation, it determines the
+child, bit for bit, in every process.
 """
 
 from __future__ import annotations

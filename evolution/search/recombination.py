@@ -26,13 +26,13 @@ _MAX_GROWTH = 2.0
 
 
 class Recombination(Search):
-    """Children are centre + sigma * scales * N(0, 1); the first generation is random."""
+    """Children are centre + sigma * scales * N(0, 1); the first generation is random unless `start_from` was called."""
 
     kept = ("centre", "average", "path", "sigma")
 
     def __init__(self, space: Space, config: SearchConfig, seed: int):
         super().__init__(space, config, seed)
-        self.centre = np.zeros(0)  # float64 [genes], or [0] before the first generation
+        self.centre = np.zeros(0)  # float64 [genes], or [0] before the first `tell` or `start_from`
         self.average = np.zeros(0)  # exponential moving average of the centres
         self._free = space.symmetry.free
         # The evolution path starts at its stationary N(0, I), not at 0, which would shrink sigma at first.

@@ -15,7 +15,11 @@ PARENTS = 64  # size of the mating pool; it bounds how many genomes each worker 
 
 
 class TwoParents(Search):
-    """Elites are kept unmodified. Both parents of each other member are drawn from the winners of tournaments."""
+    """Elites are kept unmodified. Both parents of each other member are drawn from the winners of tournaments.
+
+    These other members are random instead in the first generation, unless `start_from` was called, and in all
+    generations if `random`.
+    """
 
     kept = ("parents", "elites")
 

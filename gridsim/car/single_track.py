@@ -1,4 +1,4 @@
-"""The dynamic single-track model: linear tyres, and load that shifts between the axles as the car brakes.
+"""The dynamic single-track model: linear tyres, and load that shifts between the axles with the acceleration.
 
 Althoff, Koschi, Manzinger 2017, "CommonRoad: Composable Benchmarks for Motion Planning on Roads", model ST. With
 speed v, yaw rate w, slip angle b, steering angle d, acceleration a, friction mu, mass m, yaw inertia I, height h of the
@@ -7,8 +7,8 @@ centre of mass and its distances lf and lr to the axles, the yaw rate and the sl
     w' = mu m / (I L) (-(lf^2 F + lr^2 R) w / v + (lr R - lf F) b + lf F d)
     b' = mu / (v L) ((lr R - lf F) w / v - (R + F) b + F d) - w
 
-where F = C_f (g lr - a h) and R = C_r (g lf + a h) are the axles' stiffnesses under load, and L = lf + lr. At
-speeds below KINEMATIC_BELOW, where the equations divide by almost 0, w and b are the kinematic bicycle's.
+where F = C_f (g lr - a h) and R = C_r (g lf + a h) are the axles' stiffnesses under load, and L = lf + lr. Where
+|v| is below KINEMATIC_BELOW, the equations would divide by almost 0: there, w and b are the kinematic bicycle's.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def parameters(vehicle: Any) -> Parameters:
 
 @leaf
 def move(model, constants, car, curvature, x, y, cosine, sine, speed, acceleration, dt):
-    """Move for dt seconds. Yaw rate and slip angle are fields of the car, which this updates.
+    """Move for dt seconds, and update the yaw rate and the slip angle in the car's state.
 
     It integrates by the implicit midpoint rule, which is stable however stiff the tyres are at low speed.
     """
@@ -79,7 +79,7 @@ def move(model, constants, car, curvature, x, y, cosine, sine, speed, accelerati
             slip_after = math.atan(tangent)
             rate_after = middle * math.sin(slip_after) / rear
         else:
-            # (1 - h/2 A) z = z0 + h/2 c for z = (yaw rate, slip) in the middle of the step; 2 z - z0 is its end.
+            # (1 - h/2 A) z = z0 + h/2 c for z = (yaw rate, slip) in the middle of the step; at its end, it is 2 z - z0.
             half = HALF * h
             a, b = ONE + half * moment * damping / middle, -half * moment * turning
             c = half * (ONE - turning / (base * middle * middle))

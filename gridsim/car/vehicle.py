@@ -24,12 +24,15 @@ class Action(IntEnum):
     REVERSE = 7
 
 
-NEUTRAL = F(Action.NONE)  # what a car with late commands does until the first one arrives
+NEUTRAL = F(Action.NONE)  # the discrete action of a car with late commands until its first command arrives
 
 
 @leaf
 def brake(constants, most, speed):
-    """Acceleration (m/s2) when braking by `most` m/s2, or by less if the car would stop within the control period."""
+    """Acceleration (m/s2) when braking by `most` m/s2, or by less if the car would stop within the control period.
+
+    It is against the motion, so above 0 for a car that rolls backwards.
+    """
     return -min(max(speed / constants.dt, -most), most)
 
 
@@ -37,8 +40,8 @@ def brake(constants, most, speed):
 def act(constants, action, speed, steering):
     """Acceleration and steering of an action in one control period.
 
-    Returns: (acceleration m/s2, steering angle rad during the period). Without left or right, the wheels return to the
-    centre. BRAKE stops the car; REVERSE slows it down, too, but then drives it backwards.
+    Returns: (acceleration m/s2, steering angle rad during the period). Without left or right, the wheels turn back
+    to the centre. BRAKE stops the car; REVERSE accelerates it backwards, even while it still drives forwards.
     """
     target = ZERO
     if action == 1 or action == 5:

@@ -1,4 +1,7 @@
-"""How the episodes of cars are drawn: map, start and traffic depend only on a car's seed and the episode's number."""
+"""How the episodes of cars are drawn.
+
+Map, start and traffic depend only on a car's seed and the episode's number, unless a reset gives the map or the start.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,8 @@ _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDiction
 def _draw(keys, episodes, which, numbers, drawn):
     """Draw for the current episodes of cars `which` [k].
 
-    Writes: `numbers` float64 [k, 2], two random numbers in [0, 1); `drawn` uint64 [k], the key of the traffic.
+    Writes: `numbers` float64 [k, 2], random numbers in [0, 1) for the map and the start; `drawn` uint64 [k], the key
+    of the traffic.
     """
     for k in range(which.shape[0]):
         i = which[k]
@@ -48,9 +52,10 @@ class Draws:
         self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, crowds: tuple[int, ...],
         config: SimConfig,
     ):  # fmt: skip
-        """Draw from these `maps`; or from this number of maps, with seeds from `map_seed` on, built when first needed.
+        """Draw from these `maps`; or, if `maps` is a number, from that many maps with seeds from `map_seed` on.
 
-        Args: `crowds`, the number of other cars on each of the scenario's roads.
+        Then maps are built when first needed. If `scenario` is a path, the first is built at once, and there may be
+        fewer, as each file is one map. Args: `crowds`, the number of other cars on each of the scenario's roads.
         """
         self.scenario, self.crowds, self.config = scenario, crowds, config
         given = [] if isinstance(maps, int) else maps
@@ -58,7 +63,7 @@ class Draws:
             self._seeds = list(dict.fromkeys(seed_of_map(scenario, map_seed + k) for k in range(maps)))
         else:
             self._seeds = [each.seed for each in maps]
-        self._own = {each.seed: each for each in given}  # the maps of `_seeds` that were built so far
+        self._own = {each.seed: each for each in given}  # maps of `_seeds`, given or built so far
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
         if not given and is_map_file(scenario):
@@ -73,7 +78,8 @@ class Draws:
     ) -> tuple[list[Map], np.ndarray, np.ndarray]:
         """Maps [k], starts [k, 5] and traffic [k, cars, TRAFFIC_FIELDS] of the current episodes of cars `which` [k].
 
-        `map_seed` and `start` (as in `GridSimVectorEnv.reset`), if given, replace what would be drawn.
+        `cars` is the largest number in `crowds`; on roads with fewer cars, the rest are absent. `map_seed` and `start`
+        (as in `GridSimVectorEnv.reset`), if given, replace what would be drawn.
         """
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
@@ -102,7 +108,7 @@ class Draws:
         return maps, starts, worlds
 
     def _map(self, seed: int) -> Map:
-        """The map with a seed, built if missing; it is kept if episodes are drawn from it."""
+        """The map with a seed, built if missing; kept only if its seed is one of those that episodes are drawn from."""
         if seed not in self._own:  # `seed_of_map` looks at files, which would slow down each reset
             seed = seed_of_map(self.scenario, seed)
         if seed in self._own:

@@ -4,21 +4,21 @@ Observation (50 m, 30 m/s and 27 degrees are the default configuration's limits)
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s. Optional features
   (`gridsim.sensing.observation`) make it longer. `motion` inserts, between ranges and speed, the closing speed of the
-  car that each ray hits, float32 [rays], as a share of 30 m/s. After the speed, `steering` appends the steering angle
-  as a share of 27 degrees, `route` four points of a route ahead, float32 [8] (`gridsim.sensing.route`), `limit` the
-  road's speed limit as a share of 30 m/s, and `mirrors` how far behind the next cars are on the right and on the left,
-  float32 [2], as shares of 20 m.
+  car that each ray hits, float32 [rays], as a share of 30 m/s (0 if it hits none). After the speed, `steering` appends
+  the steering angle as a share of 27 degrees, `route` four points of a route ahead, float32 [8]
+  (`gridsim.sensing.route`), `limit` the road's speed limit as a share of 30 m/s, and `mirrors` how far behind the next
+  cars are on the right and on the left, float32 [2], as shares of 20 m with any configuration (1 if there is none).
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the latest occupancy grids (`gridsim.sensing.grid`), the newest
   last, and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (1.5 s without progress) ends
-an episode without a penalty: its last step is rewarded like any other.
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (by default, 1.5 s without
+progress) ends an episode without a penalty: its last step is rewarded like any other.
 
-An episode's map, start and traffic depend only on its car's seed and on how many episodes the car had since it was
-seeded: after `reset(seed=s)`, car i gets the episodes that a single environment gets after `reset(seed=s + i)`,
-whatever the other cars do.
+Unless `reset` names them, an episode's map and start, and its traffic, depend only on its car's seed and on how many
+episodes the car had since it was seeded: after `reset(seed=s)`, car i gets the episodes that a single environment gets
+after `reset(seed=s + i)`, whatever the other cars do.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from gridsim.view.display import has_display
 if TYPE_CHECKING:
     from gridsim.view.render import Renderer, Window
 
-RENDER_SIZE = (640, 480)  # pixels
+RENDER_SIZE = (640, 480)  # pixels, width and height
 
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
 
@@ -67,7 +67,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     `autoreset_mode` says when the next episode begins. `NEXT_STEP`: in the step after the end; in that step the car
     does not drive. `SAME_STEP`: in the step of the end; info then has the ended episodes' last observations as
     `final_obs`, an array of objects, and their last info as `final_info`. `DISABLED`: when the caller resets the cars
-    whose episodes have ended, by `reset(options={"reset_mask": mask})`.
+    whose episodes have ended, by `reset(options={"reset_mask": mask})`, or all cars, by `reset()`.
 
     info, arrays [n]: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number
     of a `state.End`, whose docstring says which ends terminate and which truncate.
@@ -78,7 +78,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         "render_fps": 1.0 / SimConfig().episode.control_period,  # a picture per control step: real time
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _window: Window | None = None  # here, as Gymnasium before 1.3 also closes environments whose __init__ failed
+    _window: Window | None = None  # on the class: Gymnasium before 1.3 also closes environments whose __init__ failed
 
     def __init__(
         self,
@@ -97,20 +97,23 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         config: SimConfig | str | None = None,
         **features: bool,
     ):
-        """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
+        """Maps are built when an episode first needs them; of a file or folder, the first map is built at once.
+
+        All environments of a process share the maps of the same scenario, seed and configuration.
 
         Args:
-            scenario: a scenario's name, a map's file (which is one map), or several of these, separated by commas.
-            maps: how many maps the episodes are drawn from, or the maps themselves.
-            map_seed: seed of the first map; the others' seeds follow.
+            scenario: a road's name, `all`, a map's file (which is one map), a folder or pattern of three or more such
+                files, or several of these, separated by commas.
+            maps: how many maps the episodes are drawn from (fewer if there are fewer files), or the maps themselves.
+            map_seed: seed of the first map; the others' seeds follow. It is not used if the maps themselves are given.
             traffic: how many other cars there are around each car: usual, heavy, a number, or a tuple with a number for
-                each of several roads; None means the scenario's default.
-            frames: grids in an observation, 1 to 8.
-            render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
-                it only where there is a display.
+                each of several roads; None means the scenario's default, which for several roads is usual.
+            frames: grids in an observation, 1 to 8; it must be 1 with `rays`.
+            render_mode: None for no pictures, `rgb_array`, or `human`, a window that follows the first car. The
+                environment's `metadata["render_modes"]` has `human` if there is a display or if it is asked for here.
             max_episode_steps: time limit in control steps; None means the configuration's.
             autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
-            config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file.
+            config: a SimConfig, or what `SimConfig.load` takes: a preset's name or a YAML file; None is `default`.
             features: which optional features (`gridsim.sensing.observation.OPTIONAL`) are observed besides the rays,
                 each True or False, such as motion=True.
         """
@@ -161,11 +164,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Begin an episode for every car, or for those of `reset_mask`.
 
         Args:
-            seed: car i is seeded with seed + i, or with seed[i]; without a seed a car goes on to its next episode.
+            seed: car i is seeded with seed + i, or with seed[i]; without a seed a car goes on to its next episode, or
+                in the very first reset gets a random seed.
             options: `map_seed`, one for all cars or one each: the map of these episodes; `start`, [5] or [n, 5]: x, y
                 (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars to reset,
                 given only after a first reset of all. Later episodes are drawn as usual.
-        Returns: (observations of all cars, info, whose masks say which cars were reset).
+        Returns: (observations of all cars, info, whose masks say which cars were reset; the others' values are 0).
         """
         known, options = ("map_seed", "start", "reset_mask"), options or {}
         for name in options:
@@ -192,7 +196,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
 
-        Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
+        Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; a car whose episode ended in an earlier
+        step does not use its action.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
         Raises: gymnasium.error.ResetNeeded before the first reset, and with `DISABLED` if an episode has ended.
         """
@@ -216,7 +221,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return observations, rewards, terminations, truncations, info
 
     def _seed(self, seed: int | np.integer | Sequence[int | None] | None, which: np.ndarray) -> None:
-        """Seed cars `which`, or let them go on to their next episodes."""
+        """Seed cars `which`; those without a seed go on to their next episodes, at first with random seeds."""
         n, draws = self.num_envs, self._draws
         seeds: list[Any] = (
             list(seed) if np.iterable(seed) else [int(seed) + i if _is_seed(seed) else seed for i in range(n)]
@@ -249,7 +254,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Begin the next episodes of the cars that `over` bool [n] marks.
 
-        Writes their first observations to `observations`. Returns: info, with the ended episodes' as `final_info`.
+        Writes their first observations to `observations`. Returns: all cars' info after that, with the ended episodes'
+        last observations and info as `final_obs` and `final_info`.
         """
         which = np.flatnonzero(over)
         last = np.full(self.num_envs, None, dtype=object)
@@ -267,8 +273,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Add what cars `which` sense to their frames. For pictures, add each car's place to its path; draw the window.
+        """Add what cars `which` sense to their frames. With a render_mode, add each car's place to its path.
 
+        With `human`, also draw the window.
         Args: `begun` bool [n], whether a car's episode has just begun.
         """
         self._observer.take(begun[which], which)
@@ -330,7 +337,10 @@ def _is_seed(seed: Any) -> TypeGuard[int]:
 
 
 class GridSimEnv(gymnasium.Env[Any, Any]):
-    """One car, as a `GridSimVectorEnv` of one: the same arguments, spaces, reward and info, no automatic resets."""
+    """One car: a `GridSimVectorEnv` of one, with the same arguments except `num_envs` and `autoreset_mode`.
+
+    Spaces and reward are those of one car; info has plain numbers and no masks. There are no automatic resets.
+    """
 
     metadata = {name: GridSimVectorEnv.metadata[name] for name in ("render_modes", "render_fps")}  # noqa: RUF012
 

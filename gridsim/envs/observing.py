@@ -15,7 +15,7 @@ Seen = np.ndarray | dict[str, np.ndarray]
 
 
 def row(observations: Seen, i: int) -> Seen:
-    """Car i's part of all cars' observations."""
+    """Car i's part of all cars' observations: views of their arrays."""
     return {name: part[i] for name, part in observations.items()} if isinstance(observations, dict) else observations[i]
 
 
@@ -40,7 +40,10 @@ class Observer:
             self.space = Dict({"grid": image, "speed": Box(low[-1:], np.ones(1, dtype=np.float32))})
 
     def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
-        """Add the newest grid to the frames of cars `which` [k]; it fills all frames if an episode has `begun` [k]."""
+        """Add the newest grid to the frames of cars `which` [k]; it fills all frames if an episode has `begun` [k].
+
+        Without grids, or with one frame, do nothing: no frames are kept.
+        """
         if self._observation == "rays" or self._stack.shape[1] == 1:
             return
         stack, newest = self._stack[which], self._grids(which)
@@ -61,5 +64,5 @@ class Observer:
         return image if self._observation == "image" else {"grid": image, "speed": numbers[:, -1:].copy()}
 
     def _grids(self, which: np.ndarray | slice) -> np.ndarray:
-        # The table is not stored: copies of it would be writable, and kernels would be compiled again for them.
+        # The table is no attribute: in a copy of this object it would be writable, and kernels would be compiled again.
         return grids(grid_table(self.config), self._simulator.ranges[which])

@@ -46,7 +46,7 @@ class SB3VecEnv(VecEnv):
         """One control period. Returns: observations, rewards, dones, infos.
 
         Where an episode ends, its info has `terminal_observation`, `TimeLimit.truncated`, `is_success`, and `episode`
-        (return `r`, length `l`), which SB3 logs; the observation is the next episode's first.
+        (return `r`, length `l`), which SB3 logs; the observation is the next episode's first. Other infos are empty.
         """
         observations, rewards, terminated, truncated, info = self.cars.step(self._actions)
         dones = terminated | truncated

@@ -1,6 +1,6 @@
 """Close parts of a picture's road with walls: the surroundings of a drawing, dead ends, and narrow places.
 
-All lengths are in units (`SimConfig.unit`).
+All lengths are in units (`SimConfig.unit`), also those of each `vehicle`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 NODE = 1.0 / CELLS_PER_UNIT
 DEEPEST = 255 / FIELD_STEPS + FIELD_FLOOR  # the largest clearance that the field holds
 MARGIN = 0.3  # free space that a car needs on each side; less is enough at starts given in a file
-FAR = 30.0  # least extent of a road; if all of it is a dead end, a car must be able to drive this far from each start
+# Least extent of a road. If all of a road is a dead end, a car must be able to drive this far from each start found.
+FAR = 30.0
 
 _CORNERS_TOO = np.ones((3, 3))  # a node's neighbours include those across its corners
 _LEAST_DRAWING = 0.05  # if a drawing encloses less than this share of the road, its surroundings are not closed
@@ -28,13 +29,13 @@ _MOST_CELLS = 1 << 19  # of road; if there are more, dead ends stay open, as the
 _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
 _STRIDE = 1.5  # between two places of an arc that are checked to be free, at most: no wall fits between them
-_SLACK = 0.5  # by which road that is kept is wider than a car needs: cells are coarse, and edges must stay as drawn
+_SLACK = 0.5  # road within a car's room plus this of kept cells stays: cells are coarse, and edges must stay as drawn
 # For easy and for hard driving: room on each side of a car, and the radius of its bends / that of its tightest bend.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 
 
 def needed(vehicle: VehicleConfig) -> float:
-    """The clearance that a car needs."""
+    """The clearance that a car needs at its middle."""
     return vehicle.width / 2 + MARGIN
 
 
@@ -99,8 +100,8 @@ def without_dead_ends(nodes: np.ndarray, vehicle: VehicleConfig) -> tuple[np.nda
     connected). The car is taken to need wide bends and much room (_EASY), unless more than twice as much road stays
     with tight bends and little room (_HARD). Nothing is closed if all road is a dead end, or if it has more than
     _MOST_CELLS cells.
-    Returns: the field; and bool [headings, cells y, cells x], whether a car can drive on from a cell with a heading:
-    within what stays; if all road is a dead end, for FAR; if there are too many cells, this is True everywhere.
+    Returns: the field; and bool [headings, cells y, cells x], whether a car at a cell with a heading can drive on:
+    without end within what stays, or for FAR if all road is a dead end. If there are too many cells, all are True.
     """
     # A cell's clearance is the largest of its nodes.
     clearance = ndimage.maximum_filter(nodes, _SIDE, origin=-1)[::_SIDE, ::_SIDE]

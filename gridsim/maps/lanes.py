@@ -2,7 +2,7 @@
 
 A path is a start pose and pieces of constant curvature, so that its points, its length and its sharpest bend are exact.
 Successors and crossings are found from the geometry: a lane's successors begin where it ends, and its crossings are
-the lanes that come too close to it.
+the lanes that come too close to it, apart from neighbours, predecessors, successors and lanes with the same beginning.
 """
 
 from __future__ import annotations
@@ -24,14 +24,18 @@ Plan = tuple[Strips, Network]  # a map's drivable area and its lanes
 
 
 class Scenario(NamedTuple):
-    """A kind of road: its layout and its driving limitations (the paper's term)."""
+    """A kind of road: its layout and its driving limitations (the paper's term).
+
+    Lengths and speeds are those for a `SimConfig.unit` of 1 m; `scenarios.build` scales them for small cars.
+    """
 
     layout: Callable[[np.random.Generator], Plan]
     speed_interval: tuple[float, float]  # m/s, lowest and highest speed at which distance counts as `state.PACED`
     traffic: int = 0  # default number of other cars
     usual_traffic: int = 6  # the number that `usual` means, if the default is 0
     thinnest: float = THICK_WALL  # m, least thickness of its walls and parked cars
-    lit: Callable[[np.random.Generator], Plan] | None = None  # its layout with lights, for `traffic.city_lights`
+    # The layout with lights, for `traffic.city_lights`; None: it never has lights.
+    lit: Callable[[np.random.Generator], Plan] | None = None
 
 
 LANE_STEP = 1.0  # m between points of a lane, at most
@@ -190,7 +194,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     """Lanes along paths, on a torus with these sides (m).
 
     Each group of `abreast` consecutive paths runs side by side, from left to right. Lanes of a group have the same
-    number of points and are neighbours. `speeds`, `clear` and `room` are 0.
+    number of points and are neighbours. `speeds`, `clear` and `room` are 0, and there are no lights.
     """
     n, sides = len(paths), np.array([width, height], dtype=np.float64)
     lengths = np.array([sum(length for length, _ in path.pieces) for path in paths])

@@ -1,9 +1,9 @@
 """Traffic lights: programs that repeat, and the stop lines that they close. A network without stop lines has no lights.
 
-While its light is not green, a stop line is a wall for the sensors of cars that drive towards it; while the light is
-red, they must not cross it. It reaches across the road, so that nobody passes beside it. All lights of a map share one
-clock, `state.CLOCK`. Its first value follows from an episode's start: the same start has the same lights, whoever
-drives.
+While its light is not green, a stop line is a wall for the sensors of an ego car that drives towards it; while the
+light is red, that car must not cross it. The line reaches across the road, so that nobody passes beside it. Other cars
+stop by `Network.signals`. All lights around an ego car share one clock, the car's `state.CLOCK`. Its first value
+follows from the episode's start: the same start has the same lights, whoever drives.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ def light(network, program, seconds):
 
 @leaf
 def set_clock(network, start, car):
-    """Set a car's clock of the lights: to that of `start` if it continues a drive, else to a hash of its place."""
+    """Set a car's clock of the lights: to that of `start` if it continues a drive, else to a hash of the car's place.
+
+    On a map without stop lines, the clock is left as it is.
+    """
     if network.lines.shape[0] > 0:
         goes_on = start.shape[0] > POSE + 2 and start[POSE + 2] > ZERO
         drawn = mix(mix(U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))))
@@ -67,7 +70,10 @@ def set_clock(network, start, car):
 
 @leaf
 def way_to_line(network, seconds, least, x, y, cosine, sine):
-    """Way (m) straight ahead to the first stop line whose light shows `least` or STOP; NO_LINE if there is none."""
+    """Way (m) from (x, y) straight ahead to the first stop line whose light shows `least` or a stricter colour.
+
+    Lines for traffic of the opposite direction do not count. NO_LINE if there is none.
+    """
     best = NO_LINE
     for k in range(network.lines.shape[0]):
         line = network.lines[k]
@@ -83,7 +89,7 @@ def way_to_line(network, seconds, least, x, y, cosine, sine):
 
 @leaf
 def crosses_line(network, seconds, car, front, x, y, cosine, sine):
-    """Whether a car's front, `front` m ahead of its middle, crosses the stop line of a red light.
+    """Whether a car's front, `front` m ahead of its middle, crosses a red light's stop line in that line's direction.
 
     The car moves from the pose in its state to the given pose near by, whose x, y may be outside the torus's sides.
     """

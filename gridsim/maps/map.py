@@ -19,16 +19,17 @@ from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, THICK_WALL, Road, St
 class Map:
     """One map. Maps are compared by identity."""
 
-    name: str  # the scenario's name, or the file's path
-    seed: int  # from which it was built
+    name: str  # the road's name in the registry, or the absolute path of the map's file, with its crop if any
+    seed: int  # the smallest seed of its part that gives this map, if the scenario is only its road (`parts.road_of`)
     road: Road
-    strips: Strips  # the exact drivable area, for pictures and tests
-    network: Network  # its lanes
+    strips: Strips  # the exact drivable area of a generated road, for pictures and tests; empty for a file
+    network: Network  # its lanes, if it has any
     torus: bool = True  # whether leaving on one side means entering on the other
     # float32 [n, 5], of a map without lanes (from a picture): where episodes begin, see `starts_at`; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
-    # bool [n], of a map from a single file: whether episodes of the seed's part (`maps.parts`) begin on each step
-    # between the network's points; without lanes, which of the file's starts are in `starts`. Empty: everywhere.
+    # bool [n], if the road is a single file, not a folder of them: whether episodes of the seed's part (`maps.parts`)
+    # may begin on each step between the network's points; without lanes, which of the file's starts are in `starts`.
+    # Empty: episodes may begin everywhere.
     begins: np.ndarray = field(default_factory=lambda: freeze(np.zeros(0, dtype=bool)))
 
     @property
@@ -56,7 +57,10 @@ class Map:
         return freeze(np.concatenate([[0.0], np.cumsum(np.diff(self.mileage) * self.begins)]))
 
     def magnified(self) -> Map:
-        """The map enlarged so that its unit (`SimConfig.unit`) is 1 m: pictures look alike for cars of any size."""
+        """The map enlarged so that its unit (`SimConfig.unit`) is 1 m: pictures look alike for cars of any size.
+
+        Only lengths that pictures need are multiplied: `starts`, speeds and stop lines are kept.
+        """
         if self.road.unit == 1.0:
             return self
         road, per_m = self.road, float(self.road.per_m)
@@ -83,7 +87,7 @@ class Map:
 
 
 def _frozen(part: Any) -> Any:
-    """A part of a map with read-only views of its arrays."""
+    """A field of a map with each array in it frozen (`jit.freeze`); numbers and text as they are."""
     if isinstance(part, tuple):
         return type(part)(*map(_frozen, part))
     return freeze(part) if isinstance(part, np.ndarray) else part
@@ -97,7 +101,10 @@ def without_lanes(
     starts: np.ndarray,
     unit: float = 1.0,
 ) -> Map:
-    """A map without lanes: a clearance field [rows, columns], not a torus, on which episodes begin at starts [n, 5]."""
+    """A map without lanes, not a torus, on which episodes begin at starts float32 [n, 5], in m.
+
+    Args: `nodes`, the clearance field [rows, columns], in units of `unit` m, as `thinnest` is; speeds in m/s.
+    """
     road = make_road(nodes, speed_interval, thinnest, unit)
     network = lay_lanes([], float(road.width), float(road.height))
     return Map(name, 0, road, Strips.of(), network, torus=False, starts=freeze(starts))
@@ -125,7 +132,7 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     """Starts float32 [n, 5], at rest, at `shares` of the way over all lanes on which episodes begin.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
-    without lanes, shares index `Map.starts`.
+    without lanes, share s gives number s * n, rounded down, of the n starts in `Map.starts`.
     Args: `shares`, float64 [n] in [0, 1), of the length of these lanes laid end to end.
     """
     if not len(road_map.network.steps):
@@ -136,5 +143,5 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
 
 
 def sample_starts(road_map: Map, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts float32 [count, 5] uniformly over the lanes; see `starts_at`."""
+    """Random starts float32 [count, 5]: those of `starts_at` for uniform shares."""
     return starts_at(road_map, rng.random(count))

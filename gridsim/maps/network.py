@@ -13,20 +13,20 @@ from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import HALF, ZERO, F, I, U, freeze, leaf, njit
 from gridsim.maps.roads import Road, clearance
 
-# Which cars of a crossing lane have priority: NEVER none; MOVING those that move, where roads give way to one another
-# in a circle; ALWAYS all, also those that stand.
+# Which cars of a crossing lane have priority over this lane's cars. NEVER: none. MOVING: those that do not stand; this
+# is used where lanes give way to one another in a circle. ALWAYS: all, also those that stand.
 NEVER, MOVING, ALWAYS = YIELDS = 0, 1, 2
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9, dtype=np.float32)  # points of a car's side, as shares of its half length
 
 
 class Network(NamedTuple):
-    """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
+    """Directed lanes as polylines of equally spaced points: s m along lane l, at index offsets[l] + s / steps[l].
 
     As kernels read them: arrays read-only and C-contiguous. `make_network` computes `speeds`, `clear` and `room`.
     """
 
     points: np.ndarray  # float32 [n, 2], m; those of a lane in driving direction, not wrapped over the torus
-    speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
+    speeds: np.ndarray  # float32 [n], m/s, traffic's top speed: low enough for bends and for gentle braking before them
     offsets: np.ndarray  # int32 [lanes + 1], where each lane's points begin
     steps: np.ndarray  # float32 [lanes], m between a lane's points; 1 m at most
     # int32 [lanes, k], padded with -1: the lanes, at least one, that begin where a lane ends, modulo the torus's sides
@@ -39,8 +39,12 @@ class Network(NamedTuple):
     # real roads, if they come close to the lane once more (`real.shape.Conflicts`).
     crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane that a car's rear must pass before this lane is free
-    yields: np.ndarray  # uint8 [c], which cars of each crossing lane have priority over this lane: `YIELDS`; [0]: none
-    room: np.ndarray  # float32 [n], m that a car at each point can move to its side of the road for oncoming cars
+    # uint8 [c], which cars of each crossing lane have priority over this lane's: one of `YIELDS`. If the array is
+    # empty, no car has priority.
+    yields: np.ndarray
+    # float32 [n], m that a car at each point can move towards the edge on its side of the road, to let the ego car
+    # pass; 0 on lanes with a neighbour.
+    room: np.ndarray
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
     # float32 [lines, 5], the stop lines of traffic lights: middle x, y (m), direction of traffic (cosine, sine), and
     # half the length (m) across that direction. Program k is that of stop line k.
@@ -64,7 +68,10 @@ class Network(NamedTuple):
 
 @njit
 def _speed_profile(points, offsets, steps, successors, tops, lateral, comfort, speeds):
-    """Top speed at each point: limited by lateral acceleration, and by comfortable braking for slower points ahead."""
+    """Write to `speeds` the top speed at each point, at most `tops` of its lane.
+
+    It is limited by lateral acceleration, and by comfortable braking for slower points ahead.
+    """
     lanes = offsets.shape[0] - 1
     for lane in range(lanes):
         first, last = offsets[lane], offsets[lane + 1] - 1
@@ -114,7 +121,10 @@ def _ease(offsets, steps, successors, slope, room):
 
 @njit
 def _room_at_side(points, offsets, road, hand, length, width, verge, most, room):
-    """How far (m) a car at each point can move towards the edge on its side of the road; found by bisection."""
+    """Write to `room` how far (m) a car at each point can move towards the edge on its side of the road.
+
+    This is found by bisection, and is `most` at most.
+    """
     for lane in range(offsets.shape[0] - 1):
         first, last = offsets[lane], offsets[lane + 1] - 1
         for p in range(first, last + 1):
@@ -141,7 +151,10 @@ def _room_at_side(points, offsets, road, hand, length, width, verge, most, room)
 
 @njit
 def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, height, apart, clear):
-    """For each crossing, the way (m) along the crossing lane to its last point within `apart` m of this lane."""
+    """Write to `clear` the way (m) along the crossing lane to its last point within `apart` m of this lane.
+
+    If there is no such point, it is negative.
+    """
     for lane in range(offsets.shape[0] - 1):
         for c in range(crossing_offsets[lane], crossing_offsets[lane + 1]):
             other = crossings[c]
@@ -234,7 +247,10 @@ def successor(network, lane, number):
 
 @leaf
 def to_side(network, shift):
-    """A shift (m) to the left as one away from traffic's side of the road, or back: -shift in left-hand traffic."""
+    """Convert a shift (m) to the left into one away from traffic's side of the road: -shift in left-hand traffic.
+
+    The same call converts it back.
+    """
     return shift if network.hand > ZERO else -shift
 
 

@@ -30,10 +30,10 @@ _TIP = 0.25  # units that a corner may extend beyond a disc of radius HALF_WALL 
 _HALO = DEEPEST + 2.0  # units around a tile within which pixels can influence it
 _TILE = 128  # nodes along a side of the tiles in which the field is computed
 
-_TOUCH = 0.05  # units free around a car at a start given in the file
+_TOUCH = 0.05  # units free around a car at a start given in the file, at least
 _SMOOTH = 3.0  # units, standard deviation of the Gaussian over which a road's direction is averaged
 _COHERENCE = 0.5  # least agreement of directions at a start, from 0 (an open place, a crossing) to 1 (a straight road)
-_STARTS = 512
+_STARTS = 512  # starts that are found on a map, at most
 _APART = 24  # nodes of wall around a window, which wraps: averages near one side must not see road near the other
 _BACK = np.array([0.0, 0.0, math.pi])
 
@@ -142,7 +142,7 @@ def _window(nodes: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 
 
 def road_length(nodes: np.ndarray) -> float:
-    """Estimated length (units) of the largest connected road: area over width. Within 10 % for a ring."""
+    """Estimated length (units) of the longest connected road: area over width. Within 10 % for a ring."""
     nodes = nodes[_window(nodes)[0]]
     road = nodes > 0.0
     labels, _ = ndimage.label(road)
@@ -172,7 +172,8 @@ def find_starts(
 
     Args: the field, a car in units of `unit` m, and whether the road has surroundings that are drawn like road.
     Returns: the field with walls where it is closed; start poses float64 [n, 3] (x, y, heading) along the road, both
-    ways, where a car has a margin around it and can drive on; the share of the road that is closed as dead ends.
+    ways, where a car has a margin around it and can drive on; the share of the road, without its surroundings, that
+    `without_dead_ends` closed.
     Raises: ValueError if there are no such poses.
     """
     index, corner = _window(nodes)
@@ -206,7 +207,10 @@ def find_starts(
 
 
 def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, unit: float = 1.0) -> None:
-    """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would not be entirely on the road."""
+    """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car with _TOUCH around it is not on the road.
+
+    The poses are in units, of `unit` m; only the message is in m.
+    """
     inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * NODE)).all(axis=1)
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):

@@ -20,7 +20,7 @@ from gridsim.jit import F, freeze, leaf, njit
 # In units (`SimConfig.unit`): metres, or less for small cars, whose roads are the same fields on a smaller scale.
 CELLS_PER_UNIT = 2  # nodes of the clearance field per unit
 FIELD_FLOOR = -2.0  # clearance of byte 0, also of places deeper inside a wall
-FIELD_STEPS = 32.0  # steps of the byte per unit; byte 255 is 5.97
+FIELD_STEPS = 32.0  # steps of the byte per unit; byte 255 is a clearance of 5.97 or more
 VISIT_CELL = 4  # side of the cells in which new ground is counted
 THICK_WALL = 3.0  # if no wall of a road is thinner, rays and collisions need no checks for thin walls
 
@@ -149,7 +149,10 @@ def node_clearance(road: Road) -> np.ndarray:
 
 @leaf
 def clearance(road, x, y):
-    """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also outside the torus."""
+    """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also beyond the sides.
+
+    It is limited to what a byte of the field holds: -2 to 5.97 units.
+    """
     nodes_per_m = F(CELLS_PER_UNIT) * road.per_m
     px, py = x * nodes_per_m, y * nodes_per_m
     fx, fy = np.floor(px), np.floor(py)  # NumPy's floor returns float32 here, that of `math` int64
@@ -176,7 +179,10 @@ def clearances(road, points):
 
 
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
-    """Clearance float32 [rows, columns] at the nodes of the field, in units; the sides must be powers of two."""
+    """Clearance float32 [rows, columns] of strips at the nodes of the field. The sides must be powers of two.
+
+    All lengths, also those of the strips, are in units.
+    """
     columns, rows = round(width * CELLS_PER_UNIT), round(height * CELLS_PER_UNIT)
     if columns.bit_count() != 1 or rows.bit_count() != 1:
         raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")

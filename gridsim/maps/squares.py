@@ -95,7 +95,7 @@ class Layout:
         arms: list[int],
         pieces: Callable[[int, float, float], Pieces] = through_square,
     ) -> None:
-        """Add lanes from each of the sides `arms` of a square to each other; `pieces` is like `through_square`."""
+        """Add lanes from each of the sides `arms` of a square to each of the others; `pieces`: as `through_square`."""
         for entry, exit in permutations(arms, 2):
             edge_x, edge_y = rotated(half, self.offset, entry)
             way = pieces((exit - entry) % 4, half, self.offset)

@@ -16,7 +16,7 @@ TILES = 8  # along each side of the torus
 LANE_WIDTH = 3.5  # m
 SHOULDER = 0.5  # m of paved road beyond each of the two lanes
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
-EDGE_SHARE = 0.9  # share of the graph's edges that are opened, unless they would close too short a block
+EDGE_SHARE = 0.9  # share of the graph's edges that are tried; one is opened unless it would close too short a block
 SHORTEST_BLOCK = 10  # tiles around each block of the network, at least
 
 
@@ -49,7 +49,8 @@ def _neighbour(tile: int, direction: int) -> int:
 def tile_graph(rng: np.random.Generator) -> np.ndarray:
     """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends.
 
-    No straight road closes round the torus, so that a car that does not steer leaves the road.
+    No straight road closes round the torus, so that a car that does not steer leaves the road. Tiles outside the
+    network have no open edge.
     """
     while True:
         opened = [[False] * 4 for _ in range(TILES * TILES)]

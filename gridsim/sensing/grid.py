@@ -26,16 +26,16 @@ from gridsim.jit import F, U, freeze, leaf, njit
 
 CELLS = 80  # along each side
 CELL = 0.5  # side of a cell, in units (`SimConfig.unit`)
-MAX_FRAMES = 8  # in an observation
+MAX_FRAMES = 8  # most grids in an observation
 #: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
 HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # of a cell, in units
 
 
 class GridTable(NamedTuple):
-    """Cells sorted by ray, then by distance; computed once for a configuration of the sensor."""
+    """The cells within the field of view, sorted by ray, then by distance; computed once for each SimConfig."""
 
-    first: np.ndarray  # int32 [rays + 1]: where each ray's part of `cells` begins; the last is its end
+    first: np.ndarray  # int32 [rays + 1]: where each ray's part of `cells` begins; the last is the end of `cells`
     cells: np.ndarray  # uint16 [cells in view]: index into a grid, row by row
     radii: np.ndarray  # float32 [cells in view + 1]: m, of the centres from the front axle; the last is infinite
     reach: np.float32  # m, the rays' full range

@@ -1,7 +1,8 @@
-"""What real sensors and actuators do: noise, rays that read nothing, and readings and commands that come late.
+"""What real sensors and actuators do: noise, rays that miss what is there, and readings and commands that come late.
 
-Noise depends only on where a car is and on its control step, so it is the same for any number of workers. For a
-perfect sensor, kernels get None instead of Imperfections, and Numba leaves their code out; likewise for Delays.
+A ray's noise and dropouts depend only on where the car is and on its control step, so they are the same for any number
+of workers. Without them, kernels get None instead of Imperfections, and Numba leaves their code out; likewise for
+Delays.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class Imperfections(NamedTuple):
     """Imperfections of the range sensor, as kernels read them."""
 
     noise: np.float32  # m, standard deviation
-    noise_share: np.float32  # the same, as a share of the range
+    noise_share: np.float32  # share of the range, added to `noise`
     dropout: np.uint64  # of 2 ** 24 readings, how many (on average) are the full range, whatever is there
 
 
@@ -35,14 +36,17 @@ class Delays(NamedTuple):
 
 
 class History(NamedTuple):
-    """The latest readings and commands of a car, which take effect late; ring buffers, indexed by control step."""
+    """The latest readings and commands of a car, which take effect late.
+
+    Ring buffers of as many steps as `Delays` (perhaps 0), indexed by the control step modulo their length.
+    """
 
     readings: np.ndarray  # float32 [steps, 2, rays], ranges and closing speeds
-    commands: np.ndarray  # float32 [steps, 2]
+    commands: np.ndarray  # float32 [steps, 2], action and 0, or pedal and wheel
 
 
 def imperfections_of(config: SimConfig) -> tuple[Imperfections | None, Delays | None]:
-    """A configuration's imperfections, None for a perfect sensor, and its delays, None if there are none."""
+    """A configuration's imperfections, None without noise and dropouts, and its delays, None if both are 0 steps."""
     sensors, period, found = config.sensors, config.episode.control_period, None
     if sensors.noise or sensors.noise_share or sensors.dropout:
         found = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
@@ -77,7 +81,10 @@ def new_history(delays, rays):
 
 @leaf
 def late_readings(history, car, ranges, closing):
-    """Replace the latest readings by those of some steps ago, or in the first steps by the first readings."""
+    """Store the latest readings, and replace them by those of `Delays.readings` steps ago.
+
+    In the first steps, those are the episode's first readings.
+    """
     if history is None or history.readings.shape[0] == 0:
         return
     steps = I(history.readings.shape[0])

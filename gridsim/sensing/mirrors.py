@@ -6,7 +6,7 @@ from gridsim.jit import ZERO, F, exact
 from gridsim.maps.network import wrapped
 from gridsim.state import COS, LANE, SIN, X, Y
 
-REACH = F(20.0)  # m behind, as far as mirrors show cars
+REACH = F(20.0)  # m behind, bumper to bumper, as far as mirrors show cars
 SAME_WAY = F(0.7)  # least cosine of the angle between the headings of cars that drive the same way
 ASIDE = F(5.5)  # m to either side that mirrors show: the next lane, not the one after it
 
@@ -16,7 +16,7 @@ def read(simulation, car, world, ways):
     """Write to `ways` float32 [2] how far behind (m) the next car on the right and the next one on the left are.
 
     The gap is bumper to bumper: 0 for a car alongside, and REACH if there is none. A car straight behind is in neither
-    mirror, nor is one that comes the other way or from the side.
+    mirror, nor is one that comes the other way or from the side, or whose middle is ahead of this car's front.
     """
     road, constants = simulation.road, simulation.constants
     ways[0] = ways[1] = REACH

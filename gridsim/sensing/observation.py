@@ -19,11 +19,13 @@ from gridsim.sensing import mirrors, route
 from gridsim.sensing.route import AHEAD
 from gridsim.state import ROUTE_KEY, SPEED, STEERING
 
-SPEED_SCALE = F(10.0)  # m/s, the speed that networks read as 0; those on rays scale it by `SimConfig.pace`
+# m/s, the speed that networks read as 0, and the closing speed that they read as 1. Networks on rays, but not those on
+# grids, multiply it by `SimConfig.pace`.
+SPEED_SCALE = F(10.0)
 
 
 class Feature(NamedTuple):
-    """A part of an observation: values in SI units, or shares."""
+    """A part of an observation. Its values are in SI units, or shares (`route`), before they are encoded."""
 
     name: str
     values: int  # how many numbers it has
@@ -34,7 +36,7 @@ class Feature(NamedTuple):
     shift: float = 0.0  # networks read value / `Feature.unit` + shift, unless `near`
     mirror: float = 1.0  # factor of the values in a mirrored world
     reversed: bool = True  # whether the values have the opposite order in a mirrored world
-    sees: str = ""  # what networks see, for help; only those that name it do (`mlp:64+steering`); "": all see it
+    sees: str = ""  # words for help; only networks that name the feature (`mlp:64+steering`) see it; "": all on rays do
 
 
 def features(k: Constants) -> tuple[Feature, ...]:
@@ -61,7 +63,8 @@ ROUTE, MIRRORS = ([feature.name for feature in FEATURES].index(name) for name in
 class Encoding(NamedTuple):
     """How an observation is encoded, as kernels read it; arrays [features]."""
 
-    first: np.ndarray  # int64 [features + 1], index of each feature's first value, then the end; if unseen, it has none
+    # int64 [features + 1], index of each feature's first value, then the end; an unseen feature's equals the next one's
+    first: np.ndarray
     near: np.ndarray  # bool
     full: np.ndarray  # float32, as the arrays below
     least: np.ndarray
@@ -106,7 +109,7 @@ def sees(encoding, feature):
 
 @exact
 def _put(encoding, feature, values, observation):
-    """If observations have this feature (a row of `features`), write its values as shares of `full`, at most 1."""
+    """If observations have this feature (a row of `features`), write its values / `full`, clipped to [`least`, 1]."""
     first, full, least = U(encoding.first[feature]), encoding.full[feature], encoding.least[feature]
     for i in range(U(encoding.first[feature + 1]) - first):  # unsigned, or it would not be vector code
         observation[first + i] = min(max(values[i] / full, least), ONE)

@@ -5,7 +5,8 @@ SplitMix64 draws the next lane and the next key. So a route has no end and takes
 lies ahead is found by walking on. An episode's first key follows from its start: the same start has the same route,
 whoever drives.
 
-The car's place on its route is the route's point nearest to the car, found by moving on from the previous step's place.
+The car's place on its route is the route's point nearest to the car, found by moving from the previous step's place,
+forwards or back.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _KEYS = U((1 << 24) - 1)  # float32 holds all whole numbers up to here
 
 
 def check_lanes(road_map: Map, features: tuple[str, ...]) -> None:
-    """Raises: GridSimError if a route is to be followed on a map from a picture."""
+    """Raises: GridSimError if a route is to be followed on a map without lanes."""
     if "route" in features and len(road_map.starts):
         raise GridSimError(f"{road_map.name} has no lanes to follow: use a policy without +route")
 
@@ -86,7 +87,7 @@ def _beside(network, car, k):
 def begin_route(network, start, car):
     """Begin the route of a car that has been put at `start`, or continue the route that the start names.
 
-    A new route begins on the nearest lane that leads in the car's direction.
+    A new route begins on the nearest lane that leads in the car's direction, or if none does, on the nearest lane.
     """
     goes_on = start.shape[0] > POSE and start[POSE + 1] > ZERO
     best = F(np.inf)

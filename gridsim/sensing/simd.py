@@ -33,9 +33,10 @@ def vector_march(steps: int, look_back: bool) -> Any:
 
     The intrinsic's arguments: `Road.field`, its columns and rows; origin, in the field's nodes; reach; the heading as
     cosine and sine; fan of `rays.fan` and the index of the first ray to march; the leap (as LEAP); ranges float32
-    [rays], written from that ray on, in [0, reach]. Lengths are in units (`SimConfig.unit`). It runs until the last ray
-    has arrived. With `look_back`, a ray goes back if the part of a step that it did not see is longer than the leap.
-    Without, no code for that is emitted, and rays may pass walls thinner than THICK_WALL.
+    [rays], of which those of the SIMD_RAYS from that ray on are written, in [0, reach]. Lengths are in units
+    (`SimConfig.unit`). It stops earlier once all these rays have arrived. With `look_back`, a ray goes back if the part
+    of a step that it did not see is longer than the leap. Without, no code for that is emitted, and rays may pass walls
+    thinner than THICK_WALL.
     """
 
     @intrinsic

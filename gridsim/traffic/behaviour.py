@@ -2,8 +2,8 @@
 
 Car following is the intelligent driver model (IDM; Treiber, Hennecke and Helbing 2000), and lane changes are MOBIL
 (Kesting, Treiber and Helbing 2007). The ego car is an obstacle like the other cars, but has the right of way at
-junctions (`junctions.py`), and oncoming cars keep to the right for it (`encounters.py`). `world.py` defines a car's
-state, `maps/network.py` the lanes.
+junctions (`junctions.py`), and oncoming and crossing cars move to their side of the road for it (`encounters.py`).
+`gridsim/state.py` defines a car's state, `maps/network.py` the lanes.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from gridsim.traffic.world import choose_lane, lane_after, lane_change_steps, po
 
 
 class Drivers(NamedTuple):
-    """Fields of `TrafficConfig` by their names, as kernels read them, with the cars' size and the control period."""
+    """What kernels read of how traffic drives: fields of `TrafficConfig` by their names, then further numbers."""
 
     acceleration: np.float32  # m/s2
-    comfort: np.float32  # m/s2, deceleration
+    comfort: np.float32  # m/s2, comfortable deceleration
     braking: np.float32  # m/s2, greatest deceleration
     headway: np.float32  # s
     jam: np.float32  # m
@@ -40,7 +40,7 @@ class Drivers(NamedTuple):
     lane_change_speed: np.float32  # m/s
     half_length: np.float32  # m
     half_width: np.float32  # m
-    dt: np.float32  # s
+    dt: np.float32  # s, control period
     lane_change_steps: np.float32  # control steps between two decisions whether to change lanes
     ego: Constants  # of the ego car, to predict its motion
 
@@ -58,6 +58,7 @@ def drivers(sim: SimConfig) -> Drivers:
 def idm(drivers, speed, desired, gap, leader):
     """Acceleration (m/s2) of the intelligent driver model: Treiber et al. 2000, equations 2 and 3.
 
+    It is -`Drivers.braking` at least.
     Args: own `speed` and `desired` speed, m/s; `gap` to the leader's rear, m, or 1e9 without a leader; `leader`, the
     leader's speed, m/s.
     """
@@ -88,10 +89,10 @@ def _ahead(network, car, other):
 
 @leaf
 def _swerve(drivers, speed, shift, sway, place, way):
-    """Move a car sideways from `shift` towards `place` (m to the left of its lane) while it drives `way` m.
+    """Shift and sway of a car that has moved from `shift` towards `place` (m left of its lane) while driving `way` m.
 
-    Returns: (shift, sway) after that; sway is m to the left per m driven. The path bends no harder than SWERVE_RADIUS
-    and the lateral acceleration of traffic in bends allow.
+    Sway is m to the left per m driven. The path bends no harder than SWERVE_RADIUS and the lateral acceleration of
+    traffic in bends allow.
     """
     bend = min(ONE / config.SWERVE_RADIUS, drivers.lateral / max(speed * speed, ONE))
     steepest = min(config.STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, ONE))
@@ -109,9 +110,9 @@ def _swerve(drivers, speed, shift, sway, place, way):
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     """Distance (m) from a car's middle along its path to where another car, at (x, y), blocks it; 1e9 if it does not.
 
-    Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's SHIFT to `furthest`
-    m towards its side of the road, but at most to what `Network.room` allows. `room` is 0 on roads with several lanes:
-    there the path returns to its lane.
+    Tests points of the path from the car's front to `horizon` m from its middle. The path swerves from the car's SHIFT
+    to `furthest` m towards its side of the road, but at most to what `Network.room` allows. `room` is 0 on roads with
+    several lanes: there the path returns to its lane.
     """
     shift, sway = car[s.SHIFT], car[s.SWAY]
     aside_by = furthest > ZERO or shift != ZERO
@@ -149,7 +150,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < ZERO:
                     return travelled
-                hop = max(free, drivers.half_width + config.CAUTION)  # the path is free for at least this far
+                hop = max(free, drivers.half_width + config.CAUTION)  # the path is free for at least `free` m
                 along += hop
                 travelled += hop
         along -= length
@@ -164,7 +165,7 @@ def update_gap(network, drivers, car, other, is_ego):
     at = F(1e9)
     dx, dy = wrapped(other[s.X] - car[s.X], network.width), wrapped(other[s.Y] - car[s.Y], network.height)
     forward = dx * car[s.COS] + dy * car[s.SIN]
-    done = forward < F(-3.0) * drivers.half_length  # a car behind is no obstacle
+    done = forward < F(-3.0) * drivers.half_length  # a car farther behind is no obstacle
     if not is_ego:
         lane = U(I(other[s.LANE]))
         at = _ahead(network, car, other) - drivers.half_length
@@ -192,7 +193,7 @@ def update_gap(network, drivers, car, other, is_ego):
 
 @leaf
 def _find_gaps(network, drivers, world, ego):
-    """Set each car's HORIZON, and find the nearest obstacle within it: GAP and LEAD_SPEED."""
+    """Set each car's HORIZON, and GAP and LEAD_SPEED of the nearest obstacle within it (1e9 and 0 if there is none)."""
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, s.SPEED]
@@ -227,7 +228,10 @@ def _desired(network, car):
 
 @leaf
 def change_lanes(network, drivers, world, i, ego):
-    """When its timer has run out, move car i to a neighbouring lane if that is safe and a gain."""
+    """When its timer has run out, let car i begin to change to a neighbouring lane if that is safe and a gain.
+
+    It does not while it is still shifted, or near a junction or a lane without neighbours (`config.KEEP_LANE`).
+    """
     car = world[i]
     if car[s.LANE_TIMER] > ZERO:
         car[s.LANE_TIMER] -= ONE
@@ -279,7 +283,10 @@ def _lanes_apart(network, lane, along, target):
 
 @leaf
 def _skew(network, lane, along, target):
-    """How far (m) the point of `target` at `along` m is ahead of the lane's with the same index; 0 if SKEW or less."""
+    """How far (m) `target`'s point is ahead of the lane's point with the same index, at `along` m of the lane.
+
+    Negative if it is behind; 0 if it is SKEW or less either way.
+    """
     k = I(along / network.steps[lane])
     one, other = network.offsets[lane] + k, network.offsets[target] + k
     first = min(other, network.offsets[target + 1] - 2)
@@ -293,9 +300,9 @@ def _skew(network, lane, along, target):
 
 @njit(_nrt=False)
 def _choose_neighbour(network, drivers, world, i, ego):
-    """Move car i to the lane that MOBIL prefers, if any (Kesting et al. 2007, equations 1 and 2).
+    """Let car i begin to change to the lane that MOBIL prefers, if any (Kesting et al. 2007, equations 1 and 2).
 
-    Not inlined: calls are expensive but rare.
+    The car is then assigned to that lane, with a SHIFT to where it is. Not inlined: calls are expensive but rare.
     """
     car = world[i]
     lane = I(car[s.LANE])
@@ -309,7 +316,8 @@ def _choose_neighbour(network, drivers, world, i, ego):
         skew = _skew(network, lane, car[s.ALONG], target)
         along = max(car[s.ALONG] / network.steps[lane] * network.steps[target] - skew, ZERO)
         apart = _lanes_apart(network, lane, car[s.ALONG], target)
-        # Distance (m) and speed of the next cars ahead and behind in the target lane, and of the one behind in its own.
+        # Distance (m) and speed (m/s) of the nearest cars ahead and behind in the target lane, and of the nearest one
+        # behind in car i's lane; for those behind, also the desired speed.
         front, front_speed, rear, rear_speed, rear_desired = F(1e9), ZERO, F(1e9), ZERO, ONE
         left_behind, left_speed, left_desired = F(1e9), ZERO, ONE
         free = True
@@ -375,7 +383,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         car[s.LANE], car[s.PERMIT] = F(best), -ONE
         car[s.NEXT] = F(choose_lane(network, best, car))
         car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
-        # While it moves over, it must not touch the car ahead in its old lane.
+        # While it moves over, it must not touch the car ahead in its old lane: if it might, the change is undone.
         car[s.GAP], car[s.LEAD_SPEED] = F(1e9), ZERO
         for j in range(world.shape[0]):
             if j != i and world[j, s.LANE] >= ZERO:
@@ -440,7 +448,8 @@ def step_traffic(network, drivers, world, ego):
         can_stop = line > car[s.SPEED] * car[s.SPEED] / (F(2.0) * drivers.comfort)
         if stops and can_stop and car[s.PERMIT] == car[s.NEXT]:
             car[s.PERMIT] = -ONE
-        # Without a permit for the junction ahead, or at a light that is not green, stop at the line.
+        # Stop at the line without a permit for the junction ahead; where there is no junction, at a light that is not
+        # green, unless the car can no longer stop comfortably.
         must_stop = car[s.PERMIT] != car[s.NEXT] if is_junction(network, onward) else stops and can_stop
         if must_stop and line < car[s.HORIZON]:
             if not stops and may_enter(network, drivers, world, i, ego, ego_way, seconds):

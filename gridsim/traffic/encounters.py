@@ -1,4 +1,7 @@
-"""How traffic reacts to an oncoming or crossing ego car: keep to the right, predict collisions and stop."""
+"""How traffic reacts to an oncoming or crossing ego car: keep to the right, predict collisions and stop.
+
+Where traffic drives on the left (`Network.hand`), cars keep to the left instead.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from gridsim.traffic.world import lane_after
 def meets_ego(network, drivers, car, ego):
     """Whether a car keeps right for the ego car, which must be near, at most a length behind, and oncoming or crossing.
 
-    A car that has already moved to the right stays there until the ego car has passed.
+    A car that has already moved to the right stays there, however the ego car turns, until that has passed or is far.
     """
     if car[s.COS] * ego[s.COS] + car[s.SIN] * ego[s.SIN] > SAME_WAY_COSINE and to_side(network, car[s.SHIFT]) >= ZERO:
         return False  # they go the same way
@@ -45,11 +48,11 @@ def shifted_right(network, k, other, right):
 
 @njit(_nrt=False)
 def way_to_ego_collision(network, drivers, car, ego):
-    """Distance (m) along a car's path to its predicted collision with the ego car; 1e9 if it should drive on.
+    """Distance (m) from a car's middle along its path to its predicted collision with the ego car; 1e9: drive on.
 
     Both are predicted at constant speed: the car along its lanes, keeping to the right, the ego car on its current arc.
-    The car drives on if they do not touch within FORESIGHT, or if the ego car would hit its rear half and it can no
-    longer stop in time.
+    The car drives on if they do not touch within FORESIGHT or on the lanes that it is known to take, or if the ego car
+    would hit the car's rear half and the car can no longer stop in time.
     Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
     lane = I(car[s.LANE])
@@ -60,7 +63,7 @@ def way_to_ego_collision(network, drivers, car, ego):
     dx, dy = wrapped(x - car[s.X], network.width), wrapped(y - car[s.Y], network.height)
     t = ZERO
     while True:
-        # s until the two can touch at the earliest.
+        # s until the two can touch at the earliest, but at least FORESIGHT_STEP.
         hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[s.SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:

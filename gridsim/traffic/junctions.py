@@ -1,6 +1,6 @@
 """Right of way at junctions. A car needs a permit to enter a junction lane; it gets one when no other car conflicts.
 
-The ego car has the right of way.
+There must also be room beyond the junction, and its light, if any, must be green. The ego car has the right of way.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _way_to_point(network, lane, x, y, within):
 
 @leaf
 def _in_ego_path(network, lane, ego, way):
-    """Whether a lane passes through the sector that reaches `way` m ahead of the ego car, or close to that car."""
+    """Whether a point of a lane, less than `way` m from the ego car, is in the sector ahead or within EGO_CLEARANCE."""
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
         dx = wrapped_any(network.points[p, 0] - ego[s.X], network.width)
         dy = wrapped_any(network.points[p, 1] - ego[s.Y], network.height)
@@ -61,9 +61,9 @@ def _in_ego_path(network, lane, ego, way):
 
 @leaf
 def _must_yield(network, drivers, car, other, first, last, seconds):
-    """Whether `car` has to give way to `other`, which is about to enter a lane with priority over the car's next lane.
+    """Whether `car` must give way to `other`, as that is about to enter a lane with priority over `car`'s next lane.
 
-    Args: `first` to `last`, the range of the car's next lane in `Network.crossings`; `seconds`, the lights' clock.
+    Args: `first` to `last`, the range of `car`'s next lane in `Network.crossings`; `seconds` on the lights' clock.
     """
     onward, speed = I(other[s.NEXT]), other[s.SPEED]
     if not is_junction(network, onward):

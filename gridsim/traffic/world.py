@@ -1,8 +1,8 @@
 """Worlds: the state of the other cars around one ego car, and where they are spawned.
 
-A world is float32 [cars, TRAFFIC_FIELDS] with the columns of `gridsim.state`. Its evolution depends only on that array
-and on the ego car. A car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego
-car.
+A world is float32 [cars, TRAFFIC_FIELDS] with the columns of `gridsim.state`. With a given map and configuration, its
+evolution depends only on that array and on the ego car. A car's centre of mass lies on its lane, shifted sideways while
+it changes lanes or meets the ego car.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ def set_pose(network, car):
     part = at - F(I(k))
     x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
     dx, dy = network.points[first + k + one, 0] - x0, network.points[first + k + one, 1] - y0
-    # The heading is interpolated between the pieces before and after, so that the car does not jerk at each point.
+    # The heading is interpolated between the lane's directions at the points before and after the car, so that the car
+    # does not jerk at each point.
     before, after = max(k, one) - one, min(k + two, last + one)
     ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
     bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
@@ -83,7 +84,7 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, lane_change_steps,
     """Spawn the cars of an empty world, at least `gap` m apart and `ego_gap` m from the ego car's `start`.
 
     A part of each lane is for spawning: it begins `first` [lanes] m along the lane. `mileage` float64 [lanes + 1] is
-    the cumulative length (m) of these parts.
+    the cumulative length (m) of these parts, 0 for lanes in junctions. A car without a place after 60 tries is absent.
     """
     draws = 0
     for i in range(world.shape[0]):
@@ -137,7 +138,8 @@ def empty_worlds(episodes: int, cars: int) -> np.ndarray:
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
     """Worlds float32 [n, cars, TRAFFIC_FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
-    Cars are uniform over the lanes outside junctions. A car for which there is no room is absent.
+    Cars are uniform over the lanes outside junctions. A car for which there is no room is absent, as are all on a map
+    without lanes.
     """
     check_traffic(cars, config)
     worlds, traffic = empty_worlds(len(starts), cars), config.traffic

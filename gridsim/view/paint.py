@@ -61,7 +61,7 @@ def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
                 for c in range(3):
                     image[j, i, c] = np.uint8(_COLOURS[3 if clear > inner else ground, c])
                 continue
-            edge = clear * scale  # pixels from the road's edge, positive on it
+            edge = clear * scale  # pixels from the road's edge, positive on the road
             off = abs(edge - line_at)
             verge = min(max(one + clear * F(1.0 / VERGE_WIDTH), zero), one)
             asphalt = min(max(edge + half, zero), one)
@@ -86,7 +86,7 @@ def smoothed(road: Road) -> Road:
 
 @njit(nogil=True)
 def draw_shapes(shapes, image):
-    """Blend rounded boxes float32 [n, 11] in pixels, in this order, into image uint8 [h, w, 3]."""
+    """Blend rounded boxes float32 [n, 11] (`SHAPE`), in pixels, into image uint8 [h, w, 3], one after the other."""
     height, width = image.shape[0], image.shape[1]
     half, zero, one = F(0.5), F(0.0), F(1.0)
     for k in range(shapes.shape[0]):

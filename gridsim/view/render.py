@@ -1,7 +1,7 @@
 """Pictures: a state of the simulator as an RGB array, or in a window. The state is not changed.
 
 Each pixel of the ground is coloured by the road's clearance there, so that edges are smooth at any scale and rotation,
-and a torus has no seam. Everything else but text is rounded boxes (lane marks, cars, rays and their dots, the path),
+and a torus has no seam. Everything else but text is rounded boxes (for example, lane marks, cars and rays),
 blended by the share of a pixel that they cover. None of this needs a display; pygame opens the window.
 """
 
@@ -217,7 +217,7 @@ class Renderer:
         return np.concatenate([rays, dots])
 
     def _write(self, image: np.ndarray, text: str, corner: str) -> None:
-        """Write a line of text on a dark pill into a corner."""
+        """Write a line of text on a dark pill into the upper or lower left corner."""
         height = self.size[1]
         edge, inner = height // 40, height // 56
         at = (edge + inner, edge + inner // 2 if corner == "upper" else height - edge - inner // 2)
@@ -294,8 +294,8 @@ class Window:
     def keys(self) -> tuple[set[str], set[str]]:
         """The keys pressed since the last call; and the same keys plus those of the arrows and space that are held now.
 
-        Both are sets of pygame's names: "up", "space", "q", "escape". They are empty if this window is closed. Also
-        closes each window that the user has asked to close.
+        Both are sets of pygame's names, such as "up", "space" and "escape". They are empty if this window is closed.
+        Also closes each window that the user has asked to close.
         """
         pygame = self._pygame
         for event in pygame.event.get():  # pygame has one queue for all windows

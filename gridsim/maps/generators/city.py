@@ -2,7 +2,7 @@
 
 Streets run along the axes at irregular distances. Each street lacks one piece, which makes T junctions and bends. A bay
 widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes. With
-`traffic.city_lights` two streets have traffic lights in their middle, as where people cross.
+`traffic.city_lights` two pieces of street have traffic lights in their middle, as where people cross.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
 BAY_SHARE = 0.6  # share of street sides with a bay, of those that are long enough
 BAY_DEPTH = 2.0  # m
 BAY_LENGTH = 12.0  # m, at least, without its rounded ends
-BAY_AWAY = 5.5  # m from the crossing, at least
+BAY_AWAY = 5.5  # m from the ends of a piece of street to a bay without its rounded ends, at least
 CAR = (2.0, 0.9)  # m, half length and half width of a parked car
 CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
 CAR_SHARE = 0.7  # share of parking places that are taken
 CAR_SKEW = 0.05  # rad, at most, either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
-LIT = 2  # streets with traffic lights, if there are any
+LIT = 2  # pieces of street with traffic lights, with `traffic.city_lights`
 LINE_OUT = 0.25  # m by which stop lines reach beyond the bays on either side
 
 
@@ -67,7 +67,7 @@ def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tup
 
 
 def city_layout(rng: np.random.Generator, lit: int = 0) -> Plan:
-    """The strips and lanes of a random city; `lit`, the number of streets with traffic lights."""
+    """The strips and lanes of a random city; `lit`, the number of pieces of street with traffic lights."""
     (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
     xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
     edges = street_graph(rng, columns, rows)
@@ -75,7 +75,7 @@ def city_layout(rng: np.random.Generator, lit: int = 0) -> Plan:
     half_road = rng.uniform(*HALF_ROAD)
     bay_half = half_road + BAY_DEPTH / 2  # the strip of a bay also covers the road
     layout = Layout(half_road, LANE_WIDTH)
-    streets: list[int] = []  # for each street, the number of the first of its two lanes
+    streets: list[int] = []  # for each piece of street, the number of the first of its two lanes
 
     def street(x: float, y: float, d: int, length: float) -> None:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""

@@ -1,7 +1,7 @@
 """The curved road: one winding two-lane loop without a junction.
 
-Random corners are joined by a short closed tour and rounded with arcs. A loop that does not bend both ways, comes too
-close to itself or has too tight a bend is drawn again.
+Random corners are joined by a short closed tour and rounded with arcs. A loop that is too short, does not bend both
+ways, comes too close to itself or has too tight or too short a bend is drawn again.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ CORNERS = (8, 15)  # a loop has 8 to 14, if so many fit
 SPACING = 42.0  # m between corners, at least
 DRAWS = 60  # points from which corners are taken
 STRAIGHT = 5.0  # m between bends, at least
-SHORTEST_BEND = 5.0  # m
+SHORTEST_BEND = 5.0  # m, arc length
 SHORTEST_LOOP = 450.0  # m
-BENDS_EACH_WAY = 2
+BENDS_EACH_WAY = 2  # bends of more than 0.3 rad to the left, and as many to the right, at least
 GAP = 3.0  # m between two parts of the road, edge to edge, at least
 NEIGHBOURS = 24.0  # m along the road within which two points may be close to each other
 
@@ -71,7 +71,7 @@ def _corners(rng: np.random.Generator) -> np.ndarray:
 
 
 def _rounded(corners: np.ndarray, rng: np.random.Generator) -> Path | None:
-    """The closed path round corners [n, 2], beginning with a straight; None if a bend does not fit."""
+    """The closed path round corners [n, 2], beginning with a straight; None if bends do not fit, or are too few."""
     edges = np.roll(corners, -1, axis=0) - corners
     lengths, headings = np.hypot(*edges.T), np.arctan2(edges[:, 1], edges[:, 0])
     turns = (headings - np.roll(headings, 1) + math.pi) % (2 * math.pi) - math.pi  # at each corner

@@ -14,7 +14,7 @@ RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rura
 HALF_RING = 4.5  # m, half width of the ring, wide enough for a lorry to turn
 FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
 HALF_FLARE = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those arcs, whose outer edge continues the arm's
-FEWEST = 6  # roundabouts on a map, at least
+FEWEST = 6  # roundabouts on a map of this file's scenario, at least
 # The arc by which the eastern arm's lane joins the ring, tangent to the lane's centre line and, from outside, to the
 # ring's: x and y of its centre (m), and where on the ring it ends (rad).
 FLARE_Y = LANE_WIDTH / 2 + FLARE

@@ -1,1 +1,1 @@
-"""Real roads from files: OpenStreetMap, OpenDRIVE, SUMO, CommonRoad and Lanelet2, each read into one description."""
+"""Real roads from files: OpenStreetMap, OpenDRIVE, SUMO, CommonRoad and Lanelet2, all read into a `RealRoad`."""

@@ -13,16 +13,16 @@ from gridsim.maps.real.description import Lane
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS
 
 FINE = 2  # pixels per node of the field, along each axis
-PIXEL = 1.0 / (CELLS_PER_UNIT * FINE)  # m; the middle of every second pixel is a node
+PIXEL = 1.0 / (CELLS_PER_UNIT * FINE)  # m, side of a pixel; the middle of every second pixel is a node
 SLIT = 2  # pixels by which the road is grown, then shrunk: this fills gaps in the data up to twice as wide
 ISLAND = 30.0  # m2; smaller pieces of wall, such as those inside junctions, become road, too
-_REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels, more than the field's largest distance
+_REACH = math.ceil((255 / FIELD_STEPS + FIELD_FLOOR) / PIXEL) + 1  # pixels: beyond the largest clearance of a field
 
-AIR = 0.3  # m of extra road on each side of cars in narrow lanes: their ends swing out in bends and lane changes
+AIR = 0.3  # m; lanes are at least `gap` + 2 * AIR wide, because cars' ends swing out in bends and lane changes
 SHARP = 0.1  # rad; where a lane turns by more than this at a point, the bend is sharp
 SWEPT = 2.5  # m around a sharp bend that become road, because a car's corners may sweep them
 _CIRCLE = np.stack([f(np.linspace(0.0, 2 * math.pi, 16, endpoint=False)) for f in (np.cos, np.sin)], axis=1)
-_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1  # pixels, more than the field's largest distance off the road
+_OUTSIDE = math.ceil(-FIELD_FLOOR / PIXEL) + 1  # pixels: deeper inside a wall than a field's lowest clearance
 
 
 def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.ndarray, gap: float) -> np.ndarray:
@@ -57,7 +57,7 @@ def clearance_of(lanes: dict[str, Lane], outlines: list[np.ndarray], size: np.nd
 
 
 def _window(used: np.ndarray) -> np.ndarray:
-    """Indices, to be wrapped, from the first to the last `used` pixel of a ring, with a margin on both sides.
+    """Indices from the first to the last `used` pixel of a ring, with a margin on both sides; not yet wrapped.
 
     The first index and the number of indices are multiples of FINE.
     """
@@ -121,7 +121,7 @@ def _signed(free, pixel, reach, outside, fine, nodes):
     """Write the distance (m) of each node to the edge between road and wall into `nodes`, positive on the road.
 
     The edge is half a pixel before the nearest pixel of the other kind, which is searched for within `reach` pixels of
-    a node on the road, and within `outside` pixels of a node off it.
+    a node on the road, and within `outside` pixels of a node off it. If there is none, that limit is used.
     """
     rows, columns = free.shape
     along = np.full((rows, columns), reach, dtype=np.uint8)

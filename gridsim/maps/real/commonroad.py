@@ -64,7 +64,10 @@ def read_commonroad(root: Element) -> RealRoad:
 
 
 def _program(light: Element, step: float) -> str:
-    """`Lane.light` of a traffic light whose times are in steps of `step` s; "" if it is off or has no cycle."""
+    """`Lane.light` of a traffic light whose times are in steps of `step` s, or in s (SHORTEST_CYCLE).
+
+    "": it is off, it has no cycle, or `program` leaves it out.
+    """
     cycle = light.find("cycle")
     if cycle is None or light.findtext("active", "true") == "false":
         return ""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 # m; where lanes are joined, the line may run backwards, if a file's nodes are closer together than junctions are wide.
-# A stretch backwards is removed if it is at most this long.
+# A point where it turns back is removed if the segment before or after it is at most this long.
 RETURN = 4.0
 RETURN_COSINE = -0.2  # a line runs backwards where the cosine of its turn at a point is at most this
 
@@ -24,8 +24,9 @@ class Lane:
     successors: list[str] = field(default_factory=list)
     left_lane: str = ""  # the lane to which a car may change, of the same direction; "": none
     right_lane: str = ""
-    junction: str | None = None  # the file's junction that the lane is in; "": none; None: the format does not tell
-    links: frozenset[str] = frozenset()  # names of the file's connections through junctions that are part of this lane
+    # name of the junction it is in ("end ..." if `ends` made the lane); "": none; None: the format does not tell
+    junction: str | None = None
+    links: frozenset[str] = frozenset()  # names of those of the file's connections that this lane contains
     yields: frozenset[str] = frozenset()  # names of connections to which cars on this lane give way, as the file says
     light: str = ""  # cycle of the traffic light at its beginning: g, y or r for each second; "": no light
 
@@ -47,8 +48,8 @@ class RealRoad:
     format: str  # the format's name for users, such as OpenStreetMap
     lanes: dict[str, Lane]
     junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
-    degrees: tuple[float, ...] = ()  # Lanelet2's: longitude and latitude of x = y = 0, m per degree of each; else ()
-    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left, 0: unknown (`load.hand_of`)
+    degrees: tuple[float, ...] = ()  # longitude, latitude of x = y = 0; m per degree of each; (): not Lanelet2, or in m
+    hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left; 0: unknown, `load.hand_of` finds it
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
     @property
@@ -77,7 +78,10 @@ def _shares(line: np.ndarray) -> np.ndarray:
 
 
 def without_repeats(line: np.ndarray, least: float = 0.01) -> np.ndarray:
-    """A polyline without points that are nearer to the one before than `least` m; its last point is kept."""
+    """A polyline without points that are less than `least` m from the point kept before them.
+
+    The first and the last point are kept; but if all are that close to the first, only the first is.
+    """
     kept = [0]
     for k in range(1, len(line)):
         if np.hypot(*(line[k, :2] - line[kept[-1], :2])) >= least:
@@ -114,7 +118,10 @@ def part_of(lane: Lane, first: float, last: float) -> Lane:
 
 
 def joined(one: Lane, other: Lane) -> Lane:
-    """One lane made of `one` and of `other`, which follows it; with the successors of `other`."""
+    """One lane made of `one` and of `other`, which follows it.
+
+    It has the successors of `other`, the neighbours of `one`, and the limit (if known) and the junction of the longer.
+    """
     left, right = (np.concatenate([a, b[1:]]) for a, b in ((one.left, other.left), (one.right, other.right)))
     kept = _without_returns((left + right)[:, :2] / 2)
     limited = [lane for lane in (other, one) if not math.isnan(lane.speed)]

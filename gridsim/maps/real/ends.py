@@ -1,4 +1,4 @@
-"""Roads that end get turning loops, or ways round the world: new roads across the sides of the torus."""
+"""Roads that end get turning loops, or ways round the world: to where others begin, often across the torus's sides."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CUT_BACK = (0.0, 15.0, 30.0)  # m by which a road is shortened to make room for 
 SPARE = 15.0  # m that are left of a shortened road, at least
 LOOP_SPEED = 30 / 3.6  # m/s, in a loop, at most
 WIDEST = 25.0  # m; lanes that end closer together than this end at the same end of a road
-LONGEST = 500.0  # m, of a way round the world
+LONGEST = 500.0  # m; every way round the world is shorter than this
 
 Pose = tuple[float, float, float]
 
@@ -85,7 +85,7 @@ class _Ground:
         return points if self.sides is None else np.mod(np.mod(points, self.sides), self.sides)
 
     def is_free(self, line: np.ndarray, but: set[str], room: float) -> bool:
-        """Whether a line [n, 2] keeps `room` m from all lanes except those in `but`."""
+        """Whether a line [n, 2] keeps `room` m from all lanes except those in `but`; added lanes always count."""
         line = self._within(line)
         near = self.tree.query_ball_point(line, room)
         if not all(self.keys[self.owner[k]] in but for found in near for k in found):
@@ -101,7 +101,10 @@ def _dense(line: np.ndarray) -> np.ndarray:
 
 
 def _open_groups(lanes: dict[str, Lane]) -> tuple[list[list[str]], list[list[str]]]:
-    """Groups of lanes side by side: those without successors, and those without predecessors; none under 1 m long."""
+    """Groups of lanes side by side of which none has a successor, and those of which none has a predecessor.
+
+    Groups with a lane of 1 m or less are left out.
+    """
     followed = {key for lane in lanes.values() for key in lane.successors}
     groups = [group for group in groups_of(lanes) if min(lanes[key].length for key in group) > 1.0]
     out = [group for group in groups if not any(lanes[key].successors for key in group)]
@@ -142,7 +145,10 @@ def add_turning_loops(road: RealRoad) -> None:
 
 
 def _add_loop(road: RealRoad, ground: _Ground, one: list[str], other: list[str]) -> bool:
-    """Add a loop from a road's end to the beginning of its opposite direction; returns whether there was room."""
+    """Add a loop from a road's end to the beginning of its opposite direction; returns whether there was room.
+
+    The road may be shortened for it (CUT_BACK).
+    """
     own = {*one, *other}
     for loop, cut in product(LOOPS, CUT_BACK):
         if cut and min(road.lanes[key].length for key in own) < cut + SPARE:
@@ -171,15 +177,15 @@ def _beside(one: Lane, other: Lane) -> bool:
 def _connections(
     lanes: dict[str, Lane], one: list[str], other: list[str], radius: float, narrowest: float, shift: np.ndarray
 ) -> list[tuple[Lane, str]]:
-    """New lanes from the ends of `one` to the beginnings of `other`, which are moved by `shift` (m).
+    """New lanes, at least `narrowest` m wide, from the ends of `one` to the beginnings of `other` moved by `shift` (m).
 
-    Each comes with the name of its predecessor.
+    Each comes with the name of its predecessor; none is added to a road yet.
     """
 
     def away(keys: list[str], at: int, to: np.ndarray) -> list[str]:
         return sorted(keys, key=lambda key: float(np.hypot(*(lanes[key].centre[at, :2] - to))))
 
-    if heading(lanes[one[0]], -1) @ heading(lanes[other[0]], 0) < 0.0:  # sorted, with the inner lanes of both first
+    if heading(lanes[one[0]], -1) @ heading(lanes[other[0]], 0) < 0.0:  # they turn back: inner lanes come first
         one = away(one, -1, lanes[other[0]].centre[0, :2] + shift)
         other = away(other, 0, lanes[one[0]].centre[-1, :2] - shift)
     count = max(len(one), len(other))
@@ -206,7 +212,7 @@ def _add(road: RealRoad, new: list[tuple[Lane, str]]) -> None:
 
 
 def join_round_the_world(road: RealRoad, sides: np.ndarray) -> None:
-    """Lead roads that still end to roads that begin elsewhere, also across the sides of the torus."""
+    """Add roads from where roads still end to where others begin, also across the sides of the torus."""
     out, back = _open_groups(road.lanes)
     found = []
     for i, one in enumerate(out):

@@ -148,7 +148,7 @@ def _may_cross(tags: dict[str, str]) -> bool:
 
 
 def _limit(tags: dict[str, str]) -> float:
-    """Speed limit (m/s) from a lanelet's tag, which is in km/h if it names no unit; without a tag, by its location."""
+    """Speed limit (m/s) from a lanelet's tag, in km/h unless it says mph or m/s; without one, by location (LIMITS)."""
     found = re.match(r"\s*([\d.]+)\s*(mph|mps|m/s)?", tags.get("speed_limit", ""))
     if not found:
         return LIMITS.get(tags.get("location", ""), math.nan)

@@ -38,7 +38,8 @@ def program(phases: Sequence[tuple[str, float]], offset: float = 0.0) -> str:
 def with_lights(network: Network, lanes: dict[str, Lane], road: Road) -> Network:
     """The network with the lights of its lanes and their stop lines.
 
-    Lights where no lanes cross are left out, and so are lights at which cars would wait inside a junction.
+    Lights where no lanes cross are left out, and so are lights at which cars would wait inside a junction. A lane ends
+    at a stop line only if all its successors have lights, and these are red together at times.
     """
     crossed = np.diff(network.crossing_offsets) > 0
     light = [lane.light if crossed[k] else "" for k, lane in enumerate(lanes.values())]

@@ -35,7 +35,7 @@ def keep(lanes: dict[str, Lane], kept: set[str]) -> dict[str, Lane]:
 
 
 def cropped(road: RealRoad, middle: np.ndarray, side: float) -> None:
-    """Keep the lanes that lie entirely in a square with this middle [2] and side (m)."""
+    """Keep the lanes whose middle lines lie entirely in a square with this middle [2] and side (m)."""
     kept = {key for key, lane in road.lanes.items() if (abs(lane.centre[:, :2] - middle) <= side / 2).all()}
     road.lanes = keep(road.lanes, kept)
 
@@ -58,11 +58,11 @@ def without_tight_turns(road: RealRoad) -> None:
 
 
 def _is_tight(line: np.ndarray) -> bool:
-    """Whether a polyline [n, 2] turns by more than TURN within the length of such an arc of radius TIGHTEST."""
+    """Whether a polyline [n, 2] turns by more than TURN within TURN * TIGHTEST m."""
     step = np.diff(line, axis=0)
     angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))])
-    # last[i] is the first point that is not within an arc's length of the end of segment i.
+    # last[i] is the first point that is TURN * TIGHTEST m or more beyond the end of segment i.
     last = np.searchsorted(along, along[1:] + TURN * TIGHTEST)
     return any(np.ptp(angle[i : max(last[i] - 1, i + 1)]) > TURN for i in range(len(angle)) if along[-1] > 0.0)
 
@@ -84,7 +84,7 @@ def _crossing(one, other):
 
 
 def on_one_level(road: RealRoad) -> None:
-    """Of two roads that cross but do not meet, drop the lower one, or without heights the slower one.
+    """Of two roads that cross but do not meet, drop the lower one, or the slower one if heights do not tell.
 
     A map is flat: nobody can drive under a bridge.
     """
@@ -114,8 +114,8 @@ def on_one_level(road: RealRoad) -> None:
 def _lower(road: RealRoad, key: str, other: str, one_line: np.ndarray, other_line: np.ndarray) -> str:
     """Which of two lanes has to go, because it passes under the other; "" for none.
 
-    If heights do not tell, but the lanes cross far from their ends and not in one junction, it is the one with the
-    lower speed limit.
+    If heights do not tell, it is the one with the lower speed limit, but only if the format tells junctions, and the
+    lanes cross far from their ends (END) and not in one junction.
     """
     one, two = road.lanes[key], road.lanes[other]
     if other in one.successors or key in two.successors:
@@ -173,7 +173,7 @@ def _largest(lanes: dict[str, Lane], connection: str) -> set[str]:
     """The lanes in the largest component (by m) of the graph of successors and lane changes, and in others nearly as
     large (NEARLY).
 
-    On a ring road, for example, each direction is a component.
+    `connection` is "weak" or "strong". On a ring road, for example, each direction is a strong component.
     """
     keys = list(lanes)
     if not keys:

@@ -22,7 +22,7 @@ LEAST = 7.0  # m, least length of a lane where traffic waits or crosses: a car a
 DIVIDED = 0.5  # m between the sides of two lanes, beyond which cars do not change from one to the other
 ACROSS = 75.0  # m, greatest length of a way across a junction that is made one lane
 ROUNDABOUT = 5  # most lanes that conflict with a lane of a roundabout: they join it or leave it
-WHOLE = 150.0  # m, greatest length of a stretch of road that is joined to one lane
+WHOLE = 150.0  # m, greatest length of a lane that `_merge` makes of several, unless one is shorter than LEAST
 NEAR_END = 25.0  # m from a road's end; lanes that cross the road within it are part of the junction at that end
 _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 ASKEW = 1.0  # m by which a car at right angles to a lane reaches closer than a parallel one: (length - width) / 2
@@ -59,7 +59,7 @@ def _find_conflicts(points, offsets, candidates, width, height, gap):
             if not candidates[i, j]:
                 continue
             other, k = points[offsets[j] : offsets[j + 1]], 0
-            # Of lanes that begin at the same place, only the parts beyond their fork count.
+            # Of lanes that begin at the same place, only the parts from where they are 2 * gap apart count.
             if math.hypot(one[0, 0] - other[0, 0], one[0, 1] - other[0, 1]) < _SAME:
                 while (
                     k < min(len(one), len(other))
@@ -88,7 +88,7 @@ def _beyond_joints(line: np.ndarray, first: bool, last: bool, gap: float) -> np.
 class Conflicts:
     """Pairs of lanes whose cars may collide: they come closer than `gap` m (`_near`), and are not side by side.
 
-    If one lane follows the other, the parts close to the point where they join do not count.
+    Parts close to the point where one lane follows the other, or where both begin, do not count.
     """
 
     def __init__(self, lanes: dict[str, Lane], gap: float, size: np.ndarray):
@@ -146,7 +146,7 @@ class Conflicts:
         return bool(self.cross[self.index[key]].any())
 
     def zone(self, key: str) -> tuple[float, float]:
-        """First and last arc length (m) of a lane at which lanes that conflict with it are too close."""
+        """First and last arc length (m) of a lane at which lanes in conflict with it are too close; (0, 0): nowhere."""
         here = self.index[key]
         line = self.lines[here]
         others = np.concatenate([self._seen_from(here, k) for k in np.flatnonzero(self.cross[here]).tolist()])
@@ -192,9 +192,10 @@ def _forward(lanes: dict[str, Lane], group: list[str], before: dict[str, list[st
 
 
 def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Join lanes that follow each other if they are WHOLE m long together at most, and none conflicts with any lane.
+    """Join groups that follow each other (`_forward`), if they are WHOLE m long together at most and have no conflicts.
 
-    If one of the lanes is shorter than LEAST, these two conditions do not matter.
+    If one of their lanes is shorter than LEAST, these two conditions do not matter. Groups are not joined if the second
+    one has a light, or if a joined lane would cross itself.
     """
     crossed = {key for key in lanes if key in conflicts}
     before = predecessors(lanes)
@@ -217,7 +218,11 @@ def _merge(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _absorb(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Make short lanes part of all lanes that lead to them, or else of all lanes that follow them."""
+    """Make short lanes part of all lanes that lead to them, or else of all lanes that follow them.
+
+    The former must lead nowhere else; nothing else may lead to the latter. Lanes up to LEAST / 2 m are short, and those
+    up to APPROACH m if the lanes around them allow it. Lanes with a light stay.
+    """
     before = predecessors(lanes)
     for key in sorted(lanes, key=lambda name: lanes[name].length):
         lane, first = lanes[key], before[key]
@@ -328,9 +333,9 @@ def _give_head(lanes: dict[str, Lane], before: dict[str, list[str]], group: list
 
 
 def _split(lanes: dict[str, Lane], group: list[str], share: float) -> list[str]:
-    """Split the lanes of a group at a share of their length; returns the second part."""
+    """Split the lanes of a group at a share of their length; returns the names of the second parts."""
     mark = "+"
-    while any(key + mark in lanes for key in group):  # one may be split twice
+    while any(key + mark in lanes for key in group):  # a group may be split twice
         mark += "+"
     names = {key: key + mark for key in group}
     for key in group:
@@ -344,7 +349,7 @@ def _split(lanes: dict[str, Lane], group: list[str], share: float) -> list[str]:
 
 
 def _lengthen(lanes: dict[str, Lane]) -> None:
-    """Make lanes shorter than LEAST longer by a piece of the road before or after them."""
+    """Lengthen lanes shorter than LEAST to that length, where possible, by a piece of the lane before or after."""
     before = predecessors(lanes)
     for key in list(lanes):
         lane = lanes[key]
@@ -358,7 +363,7 @@ def _lengthen(lanes: dict[str, Lane]) -> None:
 
 
 def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
-    """Make the part of a road that other lanes cross a part of the junction at its end, or a lane of its own."""
+    """Make the stretch of a road that other lanes cross part of the junction at an end of it, or separate lanes."""
     before = predecessors(lanes)
     for group in groups_of(lanes):
         crossed = [key for key in group if key in conflicts]
@@ -385,7 +390,7 @@ def _clear_roads(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
 
 
 def _unlink(lanes: dict[str, Lane], gap: float) -> None:
-    """Make lanes that run into one another or apart neighbours no longer."""
+    """Unlink neighbouring lanes that come closer than `gap` m, or whose sides are over DIVIDED m apart somewhere."""
     for group in groups_of(lanes):
         for left, right in pairwise(group):
             n = max(math.ceil(lanes[left].length / LANE_STEP), 1)

@@ -18,7 +18,7 @@ from gridsim.maps.real.content import INSTALL, Element, parse
 from gridsim.maps.real.description import Lane, RealRoad, bounds_of, without_repeats
 from gridsim.maps.real.lights import program
 
-TIME_LIMIT = 120.0  # s
+TIME_LIMIT = 120.0  # s, for netconvert
 COLOURS = {"r": "r", "u": "r", "y": "y", "Y": "y"}  # by SUMO's signal state; all others, also off, count as green
 METRES_PER_DEGREE = 111_320.0  # of latitude
 OPTIONS = {
@@ -68,7 +68,8 @@ def convert(
     """The roads of an OpenStreetMap ("osm") or OpenDRIVE ("opendrive") file.
 
     `crop`, for OpenStreetMap only, is a square: latitude and longitude of its middle, and its side (m). `hand` is the
-    side on which traffic drives: 1 right, -1 left; None: the file decides.
+    side on which traffic drives: 1 right, -1 left; None: it follows from the coordinates
+    (`keeps_left`, OpenStreetMap) or from the rule in the file (OpenDRIVE).
     """
     options, notes = list(OPTIONS[kind]), []
     if kind == "osm":
@@ -85,7 +86,8 @@ def convert(
     else:
         lefthand = b'rule="LHT"' in data or b"rule='LHT'" in data if hand is None else hand < 0.0
     # netconvert puts the lanes of an OpenDRIVE road that keeps left on the wrong side of its median. If such a file
-    # has no junctions, it is converted as one that keeps right: then only the directions of the lanes are wrong.
+    # has no junctions, it is converted as one that keeps right: then only the directions of the lanes are wrong, and
+    # `_turn_round` reverses them.
     turned = lefthand and kind == "opendrive" and root.find("junction") is None
     options += ["--lefthand"] * (lefthand and not turned)
     net = _netconvert(path, data, kind, options)
@@ -98,7 +100,7 @@ def convert(
 
 
 def _netconvert(path: Path, data: bytes, kind: str, options: list[str]) -> bytes:
-    """The SUMO net (XML) that netconvert makes of a file. Raises: GridSimError with the first line of its errors."""
+    """The SUMO net (XML) that netconvert makes of a file; if that fails, with --ignore-errors. Raises: GridSimError."""
     spec = find_spec("sumo")
     home = Path((spec.submodule_search_locations or [""])[0]) if spec else None
     if home is None or not (home / "bin" / "netconvert").is_file():
@@ -143,7 +145,7 @@ def _limits(root: Element) -> dict[str, float]:
 
 
 def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
-    """The roads of a SUMO net, with a lane for each connection through a junction; `limits`: m/s by OpenDRIVE road."""
+    """The roads of a SUMO net, with lanes across junctions. `limits` (m/s, by OpenDRIVE road) replace the net's."""
     inner: dict[str, Element] = {}
     lanes: dict[str, Lane] = {}
     numbered: dict[tuple[str, int], str] = {}
@@ -184,7 +186,11 @@ def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
 def _add_connections(
     root: Element, road: RealRoad, inner: dict[str, Element], numbered: dict[tuple[str, int], str]
 ) -> None:
-    """A lane for each connection but U-turns: its internal lanes one after the other, or a curve if there are none."""
+    """Add a lane for each connection of two lanes of the road, except U-turns.
+
+    It consists of the connection's internal lanes, or is a curve if there are none. Where a lane ends at the beginning
+    of another, that one follows it without a lane between.
+    """
     onward = {
         f"{c.get('from')}_{c.get('fromLane')}": c.get("via", "")
         for c in root.iterfind("connection")
