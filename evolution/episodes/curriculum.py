@@ -98,7 +98,7 @@ class Curriculum:
         self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], sim: SimConfig,
         crowds: Sequence[int] = (0,),
     ):  # fmt: skip
-        """Args: `build` makes the map of a seed; `crowds`, the number of other cars on each road."""
+        """Args: `build` makes the map of a seed; `crowds`, the usual number of other cars on each road."""
         self.config, self.seed, self.build, self.sim = config, seed, build, sim
         self.roads, self.crowds = len(crowds), crowds
         self.training_crowds = [round(config.crowd * cars) for cars in crowds]

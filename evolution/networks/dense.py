@@ -15,14 +15,15 @@ from numba.core.extending import intrinsic
 
 
 def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """Make a function for kernels: biases plus weights times inputs, of `lanes` units at `positions` positions.
+    """Make a function for kernels: biases plus weights times inputs, of `lanes` units (one vector) at `positions`.
 
     If `rectify`, the function applies ReLU. Its arguments are float32 arrays of any length, offsets in them and
     strides: inputs `x`, from `x_at` on, with stride `x_step` of positions; number and stride of planes, number and
-    stride of rows, length `run` of a run; weights `w`, from `w_at` on, with `width` units in the whole layer; biases,
-    also in `w`, from `bias_at` on; outputs `y`, from `y_at` on, with stride `y_step` of positions. Each run is summed
-    in `chains` independent parts, which hides the latency of additions where there are few lanes and positions; the
-    order of sums is the same on any machine.
+    stride of rows, and `run`, the number of inputs in a row; weights `w`, from `w_at` on, with `width` units in the
+    whole layer; biases, also in `w`, from `bias_at` on; outputs `y`, from `y_at` on, with stride `y_step` of positions.
+    The inputs of a row take turns among `chains` sums, which are added at the very end (a remainder goes to the first),
+    so that additions need not wait for each other where there are few units and positions. Their order is the same on
+    any machine.
     """
 
     @intrinsic

@@ -46,9 +46,10 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read a text such as `mlp:6,7+motion+steering`, `cnn` or `cnn:16,32,256@4`, each also with `+continuous`.
+        """Read `mlp:6,7`, perhaps with features (`+motion+steering`), or `cnn`, perhaps with sizes (`:16,32,256@4`).
 
-        Raises: GridSimError if a text has another form or its sizes are not allowed.
+        Features come in the order of OPTIONAL; either may end with `+continuous`. Raises: GridSimError if a text has
+        another form or its sizes are not allowed.
         """
         network = text.removesuffix(CONTINUOUS)
         actions: Actions = "discrete" if network == text else "continuous"

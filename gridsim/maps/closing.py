@@ -30,7 +30,7 @@ _TURNS = 16  # headings of a car at a cell
 _TURN = 2 * math.pi / _TURNS
 _STRIDE = 1.5  # between two places of an arc that are checked to be free, at most: no wall fits between them
 _SLACK = 0.5  # road within a car's room plus this of kept cells stays: cells are coarse, and edges must stay as drawn
-# For easy and for hard driving: room on each side of a car, and the radius of its bends / that of its tightest bend.
+# For easy and for hard driving: room (in units) on each side of a car; radius of its arcs, as a multiple of its least.
 _EASY, _HARD = (1.25, 2.0), (MARGIN, 1.1)
 
 

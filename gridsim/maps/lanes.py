@@ -41,7 +41,7 @@ class Scenario(NamedTuple):
 LANE_STEP = 1.0  # m between points of a lane, at most
 FORKS = 3  # most successors of a lane on generated roads: straight on, left and right; real roads may have more
 _SAME = 0.01  # m and rad within which one lane's end is another's beginning
-_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
+_ROUNDED = 1e-3  # m, added to half the sides of lanes' bounding boxes: more than float32 rounds off
 
 
 class Path(NamedTuple):

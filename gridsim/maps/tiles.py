@@ -16,7 +16,7 @@ TILES = 8  # along each side of the torus
 LANE_WIDTH = 3.5  # m
 SHOULDER = 0.5  # m of paved road beyond each of the two lanes
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
-EDGE_SHARE = 0.9  # share of the graph's edges that are tried; one is opened unless it would close too short a block
+EDGE_SHARE = 0.9  # share of the graph's edges that are tried; each becomes a road unless that closes too short a block
 SHORTEST_BLOCK = 10  # tiles around each block of the network, at least
 
 

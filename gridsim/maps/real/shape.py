@@ -24,7 +24,7 @@ ACROSS = 75.0  # m, greatest length of a way across a junction that is made one 
 ROUNDABOUT = 5  # most lanes that conflict with a lane of a roundabout: they join it or leave it
 WHOLE = 150.0  # m, greatest length of a lane that `_merge` makes of several, unless one is shorter than LEAST
 NEAR_END = 25.0  # m from a road's end; lanes that cross the road within it are part of the junction at that end
-_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
+_ROUNDED = 1e-3  # m, added to half the sides of lanes' bounding boxes: more than float32 rounds off
 ASKEW = 1.0  # m by which a car at right angles to a lane reaches closer than a parallel one: (length - width) / 2
 _SAME = 0.5  # m within which two lanes begin at the same place
 
