@@ -20,7 +20,8 @@ from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.parts import TRAINING_SEED, road_number
-from gridsim.maps.scenarios import Traffic
+from gridsim.maps.scenarios import AMOUNTS, Traffic
+from gridsim.traffic.world import check_traffic
 
 MAPS = 128  # training maps from which episodes are drawn
 MAX_EPISODES = 10_000
@@ -68,8 +69,8 @@ class Evaluator:
         if policy:
             spec = PolicySpec.parse(policy)
             given["observation"], actions = spec.observation, spec.actions if spec.suffix else actions
-        if isinstance(sim, SimConfig) and sim.unit < 1.0 and traffic == -1:
-            traffic = 0  # as by default for small cars; the settings do not know this one
+        if isinstance(sim, SimConfig) and sim.unit < 1.0 and traffic in (-1, *AMOUNTS):
+            traffic = 0  # as for small cars of a preset; the settings do not know this one
         settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, actions=actions, **given)
         settings.check()
         check_workers(workers, 0.0)
@@ -77,6 +78,7 @@ class Evaluator:
             raise GridSimError(f"episodes must be 1 to {MAX_EPISODES:,}, not {episodes}")
         self._settings, self._episodes = settings, episodes
         self._sim = settings.simulator() if isinstance(sim, str) else sim
+        check_traffic(max(settings.crowds), self._sim)
         self.spec = PolicySpec.parse(settings.policy)
         self.genes: int = self.spec.size
         self._maps = Maps(settings.scenario, self._sim)

@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import get_type_hints
 
+import matplotlib.font_manager  # noqa: F401 - builds its cache, of which the notebook would warn
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import GoogleDocstring
 

@@ -250,13 +250,15 @@ class SimConfig:
             least, most = (number(end, f"randomise.{name}", *LIMITS["vehicle"][name]) for end in ends)
             if least > most:
                 raise GridSimError(f"randomise.{name} must be least and most, not {least:g} and {most:g}")
+            for length in (least, most) if name == "length" else ():
+                if replace(self, vehicle=replace(self.vehicle, length=length)).unit != self.unit:
+                    text = f"roads are not scaled for cars of {length:g} m, but for one of {self.vehicle.length:g} m"
+                    raise GridSimError(f"randomise.length: {text}")
+        drawn: dict[str, Any] = {name: least for name, least, _ in self.randomise}
         for (one, *ends), (other, *others) in combinations_with_replacement(self.randomise, 2):
             for end, other_end in product(ends, others):  # two numbers that are drawn may contradict each other
-                changed: dict[str, Any] = {one: end, other: other_end}
-                drawn = replace(self, vehicle=replace(self.vehicle, **changed), randomise=())
-                drawn.check()
-                if drawn.unit != self.unit:
-                    raise GridSimError(f"randomise.{one}: a car of {end:g} m is for roads of another scale")
+                vehicle = replace(self.vehicle, **drawn | {one: end, other: other_end})
+                replace(self, vehicle=vehicle, randomise=()).check()
         vehicle, traffic, episode = self.vehicle, self.traffic, self.episode
         if vehicle.model not in MODELS:
             raise GridSimError(f"vehicle.model must be {' or '.join(MODELS)}, not {shown(vehicle.model)}")

@@ -66,7 +66,8 @@ def test_package_keeps_the_rules_and_its_files_and_folders_stay_small(root: Path
 def test_the_page_on_architecture_names_every_file(root: Path) -> None:
     page = (root / "docs/architecture.md").read_text(encoding="utf-8")
     files = [file for package in RANK for file in (root / package).rglob("*.py") if file.name != "__init__.py"]
-    assert [file for file in files if file.name not in page and file.parent.name != "generators"] == []
+    names = Counter(file.name for file in files if file.parent.name != "generators")
+    assert [name for name, count in names.items() if page.count(name) < count] == []
 
 
 @pytest.mark.parametrize("parts", [99, 2], ids=["files", "rooms"])

@@ -40,9 +40,9 @@ TUTORIALS = {
 }
 ELSEWHERE = {
     "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
-    "make compare": "tests/cluster/test_compare.py::test_a_comparison_that_is_stopped",
+    "make compare": "tests/cluster/test_compare.py::test_a_comparison_that_is_stopped",  # without make
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
-    ".venv/bin/gridsim-evolve --resume runs/<name>": "tests/cluster/test_cli.py::test_config_repeats_a_run",
+    ".venv/bin/gridsim-evolve --resume runs/<name>": "tests/cluster/test_cli.py::test_a_run_goes_on_in_any_mode",
     ".venv/bin/gridsim-evolve --name X --resume-if-exists": "tests/cluster/test_cli.py::test_start_or_continue",
     ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "tests/cluster/test_cli.py::test_config_repeats_a_run",
     ".venv/bin/gridsim-evolve --init runs/<name>": "tests/cluster/test_cli.py::test_init_begins_with_a_champion",

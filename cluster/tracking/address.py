@@ -128,9 +128,9 @@ def with_password(saved: str) -> str:
 
     So a file or a flag needs to hold no password. An address that holds one stays as it is.
     """
-    usual, shown = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/"), redacted(saved)
-    same = redacted(usual) == shown == saved.rstrip("/")
-    return usual if same and not saved.endswith(UNCLEAR) else saved
+    usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
+    plain = re.sub("//[^/:@]*@", "//", saved.rstrip("/"))  # without a user
+    return usual if redacted(usual) == redacted(plain) == plain and not saved.endswith(UNCLEAR) else saved
 
 
 def reach_loopback_directly() -> None:

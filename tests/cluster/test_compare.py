@@ -146,8 +146,8 @@ def processes_of(process):
 @pytest.mark.usefixtures("database")
 def test_a_comparison_that_is_stopped_and_killed_goes_on_to_the_champions_of_each_run_alone(tmp_path):
     folder = tmp_path / "runs/c"
-    planned = Plan(("curved",), ("evolution",), 3, budget="1G", population=48, generations=25).planned(folder)
-    flags = "--scenarios curved --learners evolution --budget 1G --population 48 --generations 25 --seeds 2 --name c"
+    planned = Plan(("curved",), ("evolution",), 3, budget="1G", population=64, generations=40).planned(folder)
+    flags = "--scenarios curved --learners evolution --budget 1G --population 64 --generations 40 --seeds 2 --name c"
     at_once = ["--workers", "0", "--jobs", "2"]
 
     def saved():

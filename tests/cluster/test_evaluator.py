@@ -67,6 +67,7 @@ def test_it_evaluates_networks_of_pedal_and_wheel(given: dict) -> None:
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
         ({"policy": "mlp"}, "mlp"),
         ({"workers": -1}, "--workers must be"),
+        ({"sim": SimConfig.load("f1tenth"), "traffic": 3}, "traffic is for cars of 2.9 m or more"),
         ({"episodes": 0}, "episodes must be 1 to 10,000, not 0"),
     ],
 )

@@ -186,7 +186,7 @@ def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(tmp_pat
         assert hint == f"continue with: {BIN}/gridsim-evolve --resume runs/r"
         (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
         assert logged.status == "FAILED"
-        assert load(run / "checkpoint.npz")[1]["steps"] == len(rows(run)), "nothing is lost"
+        assert load(run / "checkpoint.npz")[1]["steps"] == len(rows(run)) > done
 
 
 @pytest.mark.e2e

@@ -35,9 +35,12 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
         preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
     ) as process:
         os.close(theirs)
-        wait_until(lambda: len(rows(run)) >= 2)
-        os.close(ours)
-        process.wait(60)
+        try:
+            wait_until(lambda: len(rows(run)) >= 2)
+            os.close(ours)
+            process.wait(60)
+        finally:
+            process.kill()
     assert process.returncode == 130
     (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
     assert logged.status == "KILLED"

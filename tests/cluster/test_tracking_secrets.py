@@ -86,13 +86,16 @@ def test_the_folder_holds_no_secret_and_a_resumed_run_finds_it_again(tmp_path, m
     assert check_uri(begun_with=saved) == saved
     monkeypatch.setenv("MLFLOW_TRACKING_URI", whole)
     assert check_uri(begun_with=saved) == whole
-    own = "postgresql://me:mine@127.0.0.1:1/db?sslmode=require"
-    assert with_password(own) == own
+    assert with_password("postgresql://u@127.0.0.1:1/db?sslmode=require") == whole
+    own = "http://me:mine@h:5000"
+    for usual in ("http://h:5000", "http://you:yours@h:5000"):
+        monkeypatch.setenv("MLFLOW_TRACKING_URI", usual)
+        assert (with_password(own), with_password("http://h:5000/")) == (own, usual)
 
 
 RUN = """
 from pathlib import Path
-from cluster.tracking.address import check_uri, with_password
+from cluster.tracking.address import check_uri
 from tracked import read_run, send, tracking, write_run
 run = tracking(write_run(Path("a"), 2), check_uri())
 print(run.wait_id(60))

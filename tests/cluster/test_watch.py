@@ -30,6 +30,7 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.state import End
+from gridsim.traffic.world import spawn
 from gridsim.view.render import Renderer
 
 
@@ -143,6 +144,22 @@ def test_a_page_of_several_champions_begins_with_all_of_them(tmp_path, monkeypat
     data = json.loads(found)
     assert [each["short"] for each in data["drives"]] == ["benchmarks", "champion_traffic.npz"]
     assert data["together"]
+
+
+def test_drives_of_a_page_are_among_as_many_cars_though_some_find_no_room(here, monkeypatch, capsys):
+    asked, shown = [], []
+
+    def spawned(network, starts, cars, *others):
+        asked.append(cars)
+        return spawn(network, starts, cars, *others)
+
+    monkeypatch.setattr(watch, "spawn", spawned)
+    monkeypatch.setattr(watch, "write_page", lambda path, title, drives, together: path.touch() or shown.extend(drives))
+    crowded = "--scenario", "curved", "--traffic", 64, "--seconds", 1, "--output", "a.html"
+    assert call(watch_main, monkeypatch, capsys, CHAMPION, CHAMPION, *crowded)[0] == 0
+    assert asked == [64, 64]
+    assert len({each.drive.boxes.shape for each in shown}) == 1
+    assert shown[0].drive.boxes.shape[1] < 64
 
 
 def test_watch_shows_a_recorded_drive(here, monkeypatch, capsys):

@@ -121,12 +121,16 @@ def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> Non
         ((("width", 2.0, 1.0),), "randomise.width must be least and most, not 2 and 1"),
         ((("width", 0.0, 1.0),), "randomise.width must be "),
         ((("rear_axle", 1.2, 2.0), ("wheelbase", 1.8, 3.0)), "rear_axle must be below vehicle.wheelbase, 1.8 m"),
-        ((("length", 1.0, 4.0),), "randomise.length: a car of 1 m is for roads of another scale"),
+        ((("width", 1.6, 2.0), ("length", 1.0, 4.0)), "randomise.length: roads are not scaled for cars of 1 m"),
     ],
 )
 def test_wrong_ranges_are_refused(randomise: tuple, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Simulator(1, replace(SimConfig(), randomise=randomise))
+
+
+def test_ranges_need_only_fit_each_other() -> None:
+    replace(SimConfig(), randomise=(("rear_axle", 2.6, 2.8), ("wheelbase", 3.0, 3.2))).check()
 
 
 @pytest.mark.parametrize(

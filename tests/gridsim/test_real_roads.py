@@ -20,7 +20,7 @@ from written_roads import (
 )
 
 from gridsim.collision import boxes_touch, collides
-from gridsim.config import SimConfig, constants
+from gridsim.config import LIMITS, SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
 from gridsim.maps.network import is_junction, make_network
@@ -398,6 +398,7 @@ def test_a_damaged_cache_is_made_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(load, "CACHE_FOLDER", tmp_path)
     name = written(tmp_path, "a.osm", osm([street((0.0, 0.0), (200.0, 0.0))]))
     first = build(name, 0)
+    assert first.size.min() >= 2 * LIMITS["sensors"]["range"][1], "a ray is shorter than half a side"
     (cache,) = tmp_path.glob("road-*.npz")
     for damaged in (b"", cache.read_bytes()[:-200]):
         load.load.cache_clear()

@@ -88,7 +88,7 @@ class Prepared:
     @classmethod
     def load(cls, path: Path) -> Prepared:
         """Read what `save` wrote. A missing or damaged file raises whatever NumPy and zipfile raise."""
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             name, *notes = (str(line) for line in arrays["text"])
             nodes = arrays["field"].astype(np.float32) / F(FIELD_STEPS) + F(FIELD_FLOOR)
             *columns, width, height, hand = (arrays[f"lanes_{key}"] for key in Network._fields)
