@@ -153,8 +153,12 @@ def test_drives_of_a_page_are_among_as_many_cars_though_some_find_no_room(here, 
         asked.append(cars)
         return spawn(network, starts, cars, *others)
 
+    def written(path, title, drives, together):
+        path.touch()
+        shown.extend(drives)
+
     monkeypatch.setattr(watch, "spawn", spawned)
-    monkeypatch.setattr(watch, "write_page", lambda path, title, drives, together: path.touch() or shown.extend(drives))
+    monkeypatch.setattr(watch, "write_page", written)
     crowded = "--scenario", "curved", "--traffic", 64, "--seconds", 1, "--output", "a.html"
     assert call(watch_main, monkeypatch, capsys, CHAMPION, CHAMPION, *crowded)[0] == 0
     assert asked == [64, 64]
