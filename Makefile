@@ -10,6 +10,8 @@ DEV    := $(VENV)/.installed-dev
 # What .venv is made with: PYTHON if given, else the first of these that is 3.11 or newer and can make one.
 PYTHON ?=
 PYTHONS := python3 python3.11 python3.12 python3.13 /usr/bin/python3
+# Compiling all that is installed would take most of a minute; Python compiles what it imports, if it may keep that.
+NO_COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 # Passed on to the command: make evolve ARGS="--scenario seamless --seed 3"
 ARGS   ?=
 PORT   ?= 5000
@@ -85,5 +87,5 @@ $(STAMP) $(DEV): pyproject.toml
 	    echo "make: name one that is not found by itself with make PYTHON=/path/to/python" >&2; exit 1; \
 	  fi; \
 	fi
-	$(BIN)/python -m pip install --disable-pip-version-check --editable ".$(EXTRA)"
+	$(BIN)/python -m pip install --disable-pip-version-check $(NO_COMPILE) --editable ".$(EXTRA)"
 	@touch $(STAMP) $@
