@@ -10,7 +10,8 @@ DEV    := $(VENV)/.installed-dev
 # What .venv is made with: PYTHON if given, else the first of these that is 3.11 or newer and can make one.
 PYTHON ?=
 PYTHONS := python3 python3.11 python3.12 python3.13 /usr/bin/python3
-# Compiling all that is installed would take most of a minute; Python compiles what it imports, if it may keep that.
+# pip would spend most of a minute on compiling all that it installs. Python itself compiles what it imports, and keeps
+# that unless PYTHONDONTWRITEBYTECODE is set.
 NO_COMPILE := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 # Passed on to the command: make evolve ARGS="--scenario seamless --seed 3"
 ARGS   ?=

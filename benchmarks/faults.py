@@ -44,7 +44,7 @@ import psutil  # type: ignore[import-untyped]
 from two_hosts import Cluster  # beside this file
 
 BIN = Path(sys.executable).parent
-SMALL = (  # with 30 generations it goes on for some time after Ray is up
+SMALL = (  # 30 generations last for some time after Ray is up
     "--scenario", "curved", "--traffic", "2", "--population", "192", "--until", "2", "--seed", "5", "--generations",
 )  # fmt: skip
 PATIENCE_S = 10  # after which a silent worker is replaced

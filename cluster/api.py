@@ -138,9 +138,9 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 
 def _settings(kind: Callable[..., Settings], settings: Settings | None, flags: dict[str, Any]) -> Settings:
-    """The settings that were given, as an object or by name. Raises GridSimError for both."""
+    """The settings that were given, as an object or by name. Raises GridSimError if both are given."""
     if settings and flags:
-        raise GridSimError(f"give settings, or {', '.join(flags)} by name; to change settings, dataclasses.replace")
+        raise GridSimError(f"give either settings or {', '.join(flags)} by name; dataclasses.replace changes settings")
     return settings or kind(**flags)
 
 

@@ -70,7 +70,7 @@ class Evaluator:
             spec = PolicySpec.parse(policy)
             given["observation"], actions = spec.observation, spec.actions if spec.suffix else actions
         if isinstance(sim, SimConfig) and sim.unit < 1.0 and traffic in (-1, *AMOUNTS):
-            traffic = 0  # as for small cars of a preset; the settings do not know this one
+            traffic = 0  # the default for small cars, which settings know by name alone
         settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, actions=actions, **given)
         settings.check()
         check_workers(workers, 0.0)

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import get_type_hints
 
-import matplotlib.font_manager  # noqa: F401 - builds its cache, of which the notebook would warn
+import matplotlib.font_manager  # noqa: F401 - finds the fonts, or the notebook would, and warn
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import GoogleDocstring
 
@@ -33,7 +33,7 @@ nb_execution_mode = "force"
 nb_execution_in_temp = nb_execution_raise_on_error = True
 nb_execution_timeout = 400  # s
 nb_merge_streams = True
-nb_output_stderr = "warn"  # which fails the build
+nb_output_stderr = "warn"  # a warning fails the build
 
 # Docstrings put code between single backquotes, and flags in plain text.
 default_role, smartquotes = "code", False
@@ -57,6 +57,15 @@ def format_docstring(app: Sphinx, what: str, name: str, thing: object, options: 
     lines[:] = re.sub(r"^(Args|Returns|Raises|Attributes):(?= )", r"\n**\1:**", text, flags=re.MULTILINE).split("\n")
 
 
+def check_notebook(app: Sphinx, error: Exception | None) -> None:
+    """Raise ValueError if the notebook's outputs lack its picture or its page, or it has installed something."""
+    if error or app.builder.name != "html":
+        return
+    page = Path(app.outdir, "first_driver.html").read_text(encoding="utf-8")
+    if "restart the kernel" in page or not all(shown in page for shown in ("<iframe srcdoc", "first_driver_files/")):
+        raise ValueError("the notebook's page is not as it should be")
+
+
 def add_drives(app: Sphinx, error: Exception | None) -> None:
     """Write the pages that frames in the text play: the run of start.md, and a champion in traffic."""
     drives = Path(app.outdir, "drives")
@@ -78,4 +87,5 @@ def add_drives(app: Sphinx, error: Exception | None) -> None:
 def setup(app: Sphinx) -> None:
     """Sphinx calls this."""
     app.connect("autodoc-process-docstring", format_docstring)
+    app.connect("build-finished", check_notebook)
     app.connect("build-finished", add_drives)

@@ -10,7 +10,7 @@ import pytest
 from commands import BIN, finish
 
 SMALL = "--scenario curved --traffic 0 --population 16 --car-steps 3000"
-COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16"
+COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --output"
 
 # What is run here, in this order, and what is added to make it small; the last of equal flags counts.
 HERE = {
@@ -18,7 +18,8 @@ HERE = {
     'make dqn ARGS="--seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --name other",
     ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 6e7": "--car-steps 100000",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",
-    "make compare ARGS=--quick": COMPARISON,
+    "make compare ARGS=--quick": f"{COMPARISON} quick",
+    "make compare": f"{COMPARISON} whole",
     ".venv/bin/gridsim-compare runs/<name> runs/<other>": "",
     ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
     ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
@@ -40,7 +41,6 @@ TUTORIALS = {
 }
 ELSEWHERE = {
     "make install": "tests/test_house.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
-    "make compare": "tests/cluster/test_compare.py::test_a_comparison_that_is_stopped",  # without make
     "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
     ".venv/bin/gridsim-evolve --resume runs/<name>": "tests/cluster/test_cli.py::test_a_run_goes_on_in_any_mode",
     ".venv/bin/gridsim-evolve --name X --resume-if-exists": "tests/cluster/test_cli.py::test_start_or_continue",

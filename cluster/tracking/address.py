@@ -129,7 +129,7 @@ def with_password(saved: str) -> str:
     So a file or a flag needs to hold no password. An address that holds one stays as it is.
     """
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
-    plain = re.sub("//[^/:@]*@", "//", saved.rstrip("/"))  # without a user
+    plain = re.sub("//[^/:@]*@", "//", saved.rstrip("/"))  # the address without a name of a user
     return usual if redacted(usual) == redacted(plain) == plain and not saved.endswith(UNCLEAR) else saved
 
 

@@ -152,7 +152,7 @@ def test_own_fitness_decides(champion):
     assert set(history[-1]) == set(Evolution.columns)
     assert history[-1]["wall_s"] > history[0]["wall_s"] > 0.0
     assert history[-1]["fitness/best"] < 0
-    with pytest.raises(GridSimError, match="give settings, or population by name"):
+    with pytest.raises(GridSimError, match="give either settings or population by name"):
         evolve(SMALL, population=8)
     assert other.genome.tobytes() != champion.genome.tobytes()
 

@@ -170,7 +170,7 @@ def test_a_cluster_is_joined_with_its_token_and_all_of_its_free_cpus(cluster: Ca
 def test_a_cluster_without_free_cpus_is_waited_for_and_named(cluster: Callable, tmp_path: Path) -> None:
     at = cluster(0)
     wanted = "there has been no worker for 6 s (--patience): Ray has 0 CPUs, 0 of them free, and a worker needs 1"
-    assert joined(tmp_path, 0, at, 6.0) == [wanted]
+    assert [joined(tmp_path, workers, at, 6.0) for workers in (0, 2)] == [[wanted], [wanted]]
 
 
 def test_what_says_nothing_is_no_cluster(tmp_path: Path) -> None:

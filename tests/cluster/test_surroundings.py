@@ -12,19 +12,19 @@ from pathlib import Path
 
 import pytest
 import tracked
-from commands import BIN, all_in_mlflow, finish, rows, running, wait_until
+from commands import BIN, finish, rows, running, same_run, wait_until
 
-from cluster.store.checkpoint import load
 from gridsim.jit import CACHE_FOLDER
 
-SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--seed", "5", "--workers", "0", "--name", "r"]
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "30", "--seed", "5"]
+REFERENCE = ("gridsim-evolve", *SMALL)
 pytestmark = pytest.mark.e2e
 
 
 @pytest.mark.usefixtures("database")
-def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(reference: Path, tmp_path: Path) -> None:
     run, (ours, theirs) = tmp_path / "runs/r", pty.openpty()
-    command = [str(BIN / "gridsim-evolve"), *SMALL]
+    command = [str(BIN / "gridsim-evolve"), *SMALL, "--workers", "0", "--name", "r"]
     with subprocess.Popen(
         command,
         cwd=tmp_path,
@@ -44,12 +44,14 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
     assert process.returncode == 130
     (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
     assert logged.status == "KILLED"
-    assert load(run / "checkpoint.npz")[1]["steps"] == len(rows(run))
+    assert len(rows(run)) < 30
+    finish("gridsim-evolve", "--workers", "0", "--resume", "runs/r", cwd=tmp_path)
+    assert same_run(run, reference)
 
 
 @pytest.mark.usefixtures("database")
 def test_a_run_is_closed_when_what_reads_its_output_is_interrupted_with_it(tmp_path: Path) -> None:
-    command = f"{BIN}/gridsim-evolve {' '.join(SMALL)} 2>&1 | tee log"
+    command = f"{BIN}/gridsim-evolve {' '.join(SMALL)} --generations 400 --workers 0 --name r 2>&1 | tee log"
 
     def status() -> str:
         found = tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")
@@ -62,7 +64,7 @@ def test_a_run_is_closed_when_what_reads_its_output_is_interrupted_with_it(tmp_p
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
-def test_neither_a_home_nor_a_users_name_is_needed(empty_database: Path) -> None:
+def test_neither_a_home_nor_a_users_name_is_needed(reference: Path, empty_database: Path) -> None:
     """As on OpenShift, with HTCondor, in systemd's units. It keeps root's right to read, as Python may lie in /root."""
     user = ["/usr/bin/setpriv", "--reuid", "54321", "--regid", "54321", "--clear-groups", "--no-new-privs"]
     user += ["--inh-caps", "+dac_read_search", "--ambient-caps", "+dac_read_search"]
@@ -74,9 +76,9 @@ def test_neither_a_home_nor_a_users_name_is_needed(empty_database: Path) -> None
         command = [*user, "/usr/bin/env", "-i", f"PATH={os.environ['PATH']}", f"TMPDIR={folder}"]
         command.append(f"{BIN}/gridsim-evolve")
         assert finish(*command, "--help", cwd=folder).stdout.startswith("usage: gridsim-evolve")
-        done = finish(*command, *SMALL, "--generations", "1", cwd=folder)
+        done = finish(*command, *SMALL, "--workers", "0", "--name", "r", cwd=folder)
         assert done.stderr == ""
-        assert all_in_mlflow(Path(folder, "runs/r"))
+        assert same_run(Path(folder, "runs/r"), reference)
 
 
 AUDIT = """
@@ -101,7 +103,7 @@ sys.addaudithook(hook)
 def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path) -> None:
     """A new variable may move the environment while another thread is in `getenv`, which crashes the process."""
     (tmp_path / "sitecustomize.py").write_text(AUDIT)
-    flags = "--scenarios curved --learners evolution dqn --seeds 1 --budget 10k --name c --jobs 2 --workers 1"
+    flags = "--scenarios curved --learners evolution dqn --seeds 1 --budget 10k --name c --jobs 2 --workers 2"
     finish("gridsim-compare", *flags.split(), cwd=tmp_path, PYTHONPATH=str(tmp_path))
     late = tmp_path / "sitecustomize.py.late"
     assert not late.exists(), late.read_text()

@@ -237,7 +237,7 @@ def prepared(name: str, digest: str, gap: float) -> Prepared:
     """What `prepare` makes of a file, from the cache if it is there."""
     path, crop, hand = split_name(name)
     kept = cached(name, digest, gap)
-    with contextlib.suppress(Exception):  # whatever a missing or damaged file raises: it is made anew
+    with contextlib.suppress(Exception):  # a missing or damaged file may raise anything; the road is prepared anew
         return Prepared.load(kept)
     try:
         made = prepare(read_road(path, crop, hand), gap)
