@@ -10,6 +10,7 @@ from typing import get_type_hints
 
 import matplotlib.font_manager  # noqa: F401 - finds the fonts, or the notebook would, and warn
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 from sphinx.ext.napoleon import GoogleDocstring
 
 import gridsim
@@ -58,12 +59,12 @@ def format_docstring(app: Sphinx, what: str, name: str, thing: object, options: 
 
 
 def check_notebook(app: Sphinx, error: Exception | None) -> None:
-    """Raise ValueError if the notebook's outputs lack its picture or its page, or it has installed something."""
+    """Raise ExtensionError if the notebook's outputs lack its picture or its page, or it has installed something."""
     if error or app.builder.name != "html":
         return
     page = Path(app.outdir, "first_driver.html").read_text(encoding="utf-8")
-    if "restart the kernel" in page or not all(shown in page for shown in ("<iframe srcdoc", "first_driver_files/")):
-        raise ValueError("the notebook's page is not as it should be")
+    if "restart the kernel" in page or not all(shown in page for shown in ("<iframe srcdoc", 'src="_images/')):
+        raise ExtensionError("the notebook's page lacks a picture or a drive, or it installed something")
 
 
 def add_drives(app: Sphinx, error: Exception | None) -> None:
