@@ -330,9 +330,9 @@ def main() -> None:
     options = parser.parse_args()
     store = Store(options.output.resolve(), commit())
     tables = quick() if options.quick else TABLES
-    subprocess.run(
-        [sys.executable, "-m", "cluster.workers.kernels", "everything"], check=True, stdout=subprocess.DEVNULL
-    )
+    if not options.quick:
+        compiled = [sys.executable, "-m", "cluster.workers.kernels", "everything"]
+        subprocess.run(compiled, check=True, stdout=subprocess.DEVNULL)
     for table in options.tables or tables:
         commands = [command for row in tables[table].values() for command in row]
         for k, command in enumerate(commands):

@@ -14,10 +14,10 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 from cluster.evaluator import Evaluator
-from cluster.fitness import Fitness, give
+from cluster.fitness import Fitness, forget, give
 from cluster.learn.learning import Event, finish
 from cluster.learn.maps import Maps
-from cluster.run import Place, new_learning, train
+from cluster.run import Place, new_learning, send, train
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.store.champion import Champion, evaluate, load_champion
 from cluster.store.checkpoint import CHECKPOINT
@@ -70,14 +70,14 @@ def evolve(
         settings: what gridsim-evolve's flags for learning set. Give these here, or by name, such as scenario="city".
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
             with fields distance (m), paced (m at a speed within the road's interval), steps, end (`gridsim.state.End`),
-            and figures of comfort, see docs/own.md) and targets (m). It runs in this process only. Default:
-            `evolution.episodes.fitness.scalar`. A string is a name as for --fitness.
+            and figures of comfort, see docs/own.md) and targets (m, float64 [episodes]). It runs in this process only.
+            Default: `evolution.episodes.fitness.scalar`. A string is a name as for --fitness.
         workers: number of Ray workers; 0 without `address`: this process evaluates, on all its cores.
         on_generation: called after each generation with the number of those done and the latest one's figures.
         folder: a new folder in which the run is kept, as gridsim-evolve does in runs/NAME; None keeps nothing.
         resume: go on with the run in `folder` if there is one; its settings must be these, but limits may be raised.
         address: a Ray cluster, host:port or "auto", to run the workers on instead of this machine; with it, 0 workers
-            mean one for each free CPU.
+            mean one for each free CPU. None is this machine, whatever RAY_ADDRESS says.
         tracking_uri: MLflow's address, to which a run with a folder is sent; None sends nothing.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
@@ -148,6 +148,7 @@ def _train(
     settings: RunSettings, workers: int, on_step: OnStep | None, folder: str | os.PathLike[str] | None, resume: bool,
     address: str | None, tracking_uri: str | None,
 ) -> Trained:  # fmt: skip
+    forget()
     settings.check()
     check_workers(workers, 0.0)
     if folder is None and (resume or tracking_uri):
@@ -180,9 +181,11 @@ def _train(
 def _train_in(
     folder: Path, settings: RunSettings, place: Place, on_row: OnStep, resume: bool, tracking_uri: str | None
 ) -> Trained:
-    """Train a new run in a folder, or resume the run in it. A run that is finished already is only read."""
+    """Train a new run in a folder, or resume the run in it. If that is finished, it is only read and sent to MLflow."""
     if resume and (folder / CHECKPOINT).is_file():
         run = open_run(folder)
+        if type(run.settings) is not type(settings):
+            raise GridSimError(f"{folder} is a run of another learner, {run.settings.command}")
         settings = settings.extending(run.settings)
         if replace(settings, **{name: getattr(run.settings, name) for name in settings.extendable}) != run.settings:
             raise GridSimError(f"{folder} is a run with other settings; give those, or another folder")
@@ -196,5 +199,10 @@ def _train_in(
         if event.warning:
             warnings.warn(event.text, stacklevel=2)
 
-    history = read_history(run.path) if is_finished(run) else train(run, place, warn, on_row).learning.history
+    if not is_finished(run):
+        history = train(run, place, warn, on_row).learning.history
+    else:
+        history = read_history(run.path)
+        if tracking_uri is not None and (unsent := send(run, place.uri)[1]):
+            warnings.warn(unsent, stacklevel=2)
     return load_champion(run.path), history

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from gridsim.traffic.world import check_traffic
 
 MAPS = 128  # training maps from which episodes are drawn
 MAX_EPISODES = 10_000
+MAX_GENOMES = 1 << 16  # that a recipe can name
 
 
 class Evaluator:
@@ -40,10 +42,10 @@ class Evaluator:
 
     def __init__(
         self,
-        scenario: str = "seamless",
+        scenario: str | os.PathLike[str] = "seamless",
         policy: str = "",
         traffic: Traffic = -1,
-        sim: SimConfig | str = "",
+        sim: SimConfig | str | os.PathLike[str] = "",
         workers: int = 0,
         address: str | None = None,
         episodes: int = 16,
@@ -58,21 +60,24 @@ class Evaluator:
             sim: the simulator's configuration (vehicle, sensors, episodes, traffic), or the name of a preset or of a
                 YAML file; "" is as by default in gridsim-evolve. A lower target and time limit make an evaluation
                 shorter.
-            workers, address: number of Ray workers, and a Ray cluster's address, by default RAY_ADDRESS; with neither,
-                threads of this process.
+            workers: number of Ray workers; 0 without `address`: this process evaluates, on all its cores.
+            address: a Ray cluster, as for `gridsim.evolve`; None is this machine, whatever RAY_ADDRESS says.
             episodes: how many each genome drives, on all roads together.
             actions: as for --actions of gridsim-evolve; continuous also if the policy's text ends with +continuous.
 
         Raises: GridSimError, a ValueError, in one line.
         """
+        sim = os.fspath(sim) if isinstance(sim, os.PathLike) else sim
         given: dict[str, Any] = {"sim": sim} if isinstance(sim, str) else {}
         if policy:
             spec = PolicySpec.parse(policy)
             given["observation"], actions = spec.observation, spec.actions if spec.suffix else actions
         if isinstance(sim, SimConfig) and sim.unit < 1.0 and traffic in (-1, *AMOUNTS):
             traffic = 0  # the default for small cars, which settings know by name alone
-        settings = EvolveSettings(scenario=scenario, policy=policy, traffic=traffic, actions=actions, **given)
-        settings.check()
+        settings = EvolveSettings(
+            scenario=os.fspath(scenario), policy=policy, traffic=traffic, actions=actions, **given
+        )
+        settings.check(None if isinstance(sim, str) else sim)
         check_workers(workers, 0.0)
         if not 1 <= episodes <= MAX_EPISODES:
             raise GridSimError(f"episodes must be 1 to {MAX_EPISODES:,}, not {episodes}")
@@ -83,7 +88,7 @@ class Evaluator:
         self.genes: int = self.spec.size
         self._maps = Maps(settings.scenario, self._sim)
         try:
-            self._pool = open_pool(workers, cluster_address(address or ""), 0.0, self._maps.build)
+            self._pool = open_pool(workers, cluster_address(address) if address else None, 0.0, self._maps.build)
         except BaseException:
             self._maps.close()
             raise
@@ -141,6 +146,8 @@ class Evaluator:
 
     def _checked(self, genomes: np.ndarray) -> np.ndarray:
         genomes = np.ascontiguousarray(genomes, dtype=np.float32)
+        if len(genomes) > MAX_GENOMES:
+            raise GridSimError(f"at most {MAX_GENOMES:,} genomes can be evaluated at once, not {len(genomes):,}")
         if genomes.ndim != 2 or genomes.shape[1] != self.genes:
             raise GridSimError(f"genomes of {self.spec} must be [n, {self.genes}], not {list(genomes.shape)}")
         finite = np.isfinite(genomes).all(axis=1)

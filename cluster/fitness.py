@@ -24,8 +24,8 @@ import numpy as np
 
 from gridsim.errors import GridSimError
 
-Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
-"""From results [n, episodes] and targets (m): scores [n], higher is better."""
+Fitness = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""From results [n, episodes] and targets float64 [episodes] (m): scores [n], higher is better."""
 
 _given: dict[str, Fitness] = {}  # functions that were given as objects, by their names
 
@@ -33,7 +33,6 @@ _given: dict[str, Fitness] = {}  # functions that were given as objects, by thei
 def give(function: Fitness) -> str:
     """Keep a function that is passed as an object. Returns: the name by which `load` finds it in this process."""
     name = f"{getattr(function, '__module__', '?')}:{getattr(function, '__qualname__', type(function).__name__)}"
-    forget()
     _given[name] = function
     return name
 
@@ -45,17 +44,18 @@ def forget() -> None:
 
 
 @cache
-def load(name: str) -> Fitness:
+def load(name: str) -> Callable[[np.ndarray, np.ndarray | float], np.ndarray]:
     """The fitness function of a name. Raises: GridSimError if it cannot be found or imported.
 
-    The function that is returned checks itself: it raises GridSimError if the user's code fails, or if its scores are
-    not one number for each member or hold a nan. Infinite ones are allowed.
+    The function that is returned also takes one target for all episodes. It checks itself: it raises GridSimError if
+    the user's code fails, or if its scores are not one number for each member or hold a nan. Infinite ones are allowed.
     """
     function = _given.get(name) or _find(name)
 
     def score(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
         try:
-            scores = np.asarray(function(results, targets), dtype=np.float64)
+            goals = np.full(results.shape[1], targets, dtype=np.float64)
+            scores = np.asarray(function(results, goals), dtype=np.float64)
         except Exception as error:
             raise GridSimError(f"--fitness {name}: {_fault(error)}") from error
         if scores.shape != (len(results),):

@@ -9,6 +9,7 @@ previous one or one of about a second ago, and a resumed run gives the same cham
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,12 +26,12 @@ from cluster.redaction import redacted
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.store import checkpoint
 from cluster.store.champion import Champion
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY
 from cluster.store.folder import ONNX, RunError, RunFolder, lock
 from cluster.store.steps import Steps, write_elites
 from cluster.text import as_argument
 from cluster.tracking.description import read_run
-from cluster.tracking.tracking import Status, Tracking
+from cluster.tracking.tracking import Status, Tracking, saved_run_id, sync
 from cluster.workers import kernels
 from cluster.workers.open import open_pool
 from cluster.workers.pool import WorkerPool
@@ -67,9 +68,11 @@ def train(
         initial: a genome to start from, float32 [genes].
         started: time.perf_counter() of the process's start, from which the run's time counts; None: now.
 
-    Raises: GridSimError, Stopped, and whatever else ends a run; the last whole step is saved.
+    Raises: GridSimError, Stopped, and whatever else ends a run; the last whole step is saved. If there is none, the
+    run's folder is left empty.
     """
     started, settings = perf_counter() if started is None else started, run.settings
+    lock(run.path)
     maps, tracking = (
         Maps(settings.scenario, settings.simulator()),
         Tracking(run.path, place.uri, place.experiment, read_run),
@@ -77,7 +80,6 @@ def train(
     pool: WorkerPool | None = None
     status: Status = "KILLED"
     try:
-        lock(run.path)
         run.write_config()
         if place.uri:
             tracking.start()
@@ -106,6 +108,19 @@ def train(
         if unsent := tracking.close(status):
             again = f"; send it later with: {settings.command} --resume {as_argument(run.path)}"
             on_event(Event(unsent + (again if status == "FINISHED" else ""), warning=True))
+        if not (run.path / CHECKPOINT).is_file():
+            with contextlib.suppress(OSError):
+                for name in (CONFIG, STEPS):
+                    (run.path / name).unlink(missing_ok=True)
+
+
+def send(run: RunFolder, uri: str, experiment: str = "") -> tuple[str, str | None]:
+    """Send to MLflow what it lacks of a finished run; arguments and result as of `tracking.sync`."""
+    sent, unsent = sync(run.path, uri, experiment, read_run)
+    if sent:  # if MLflow was away as the run ended, the summary lacks the id
+        summary = json.loads((run.path / SUMMARY).read_bytes())
+        checkpoint.write_json(run.path / SUMMARY, summary | {"mlflow_run_id": saved_run_id(run.path)})
+    return sent, unsent
 
 
 def new_learning(settings: RunSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None) -> Learning:

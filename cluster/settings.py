@@ -82,6 +82,12 @@ class RunSettings(ABC):
     follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
+        for name in ("scenario", "sim"):
+            value: Any = getattr(self, name)
+            if isinstance(value, os.PathLike):
+                object.__setattr__(self, name, os.fspath(value))
+            elif not isinstance(value, str):
+                raise GridSimError(f"setting {name!r} must be a name or a file's path, not a {type(value).__name__}")
         object.__setattr__(self, "scenario", full_name(self.scenario))  # config.json may be read from another folder
         if not self.sim:
             roads = roads_of(self.scenario)
@@ -157,11 +163,14 @@ class RunSettings(ABC):
         """Whether a run with these counters (`Learning.counts`, and `solved`) is finished."""
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
 
-    def check(self) -> None:
-        """Raises GridSimError if no run can have these settings; its one line says what to change."""
+    def check(self, sim: SimConfig | None = None) -> None:
+        """Raises GridSimError if no run can have these settings; its one line says what to change.
+
+        Args: `sim`, the simulator's numbers in place of those that the settings name.
+        """
         _check_types(type(self), vars(self))
         check_name(self.scenario)
-        sim, roads = self.simulator(), roads_of(self.scenario)
+        sim, roads = sim or self.simulator(), roads_of(self.scenario)
         if not all(0 <= cars <= MAX_TRAFFIC for cars in self.crowds):
             raise GridSimError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
         if any(self.crowds) and (without := [road for road in roads if not has_lanes(road)]):
@@ -286,8 +295,8 @@ class EvolveSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
 
-    def check(self) -> None:
-        super().check()
+    def check(self, sim: SimConfig | None = None) -> None:
+        super().check(sim)
         if PolicySpec.parse(self.policy).actions != self.actions:
             raise GridSimError(f"policy {self.policy} sets pedal and wheel; give --actions continuous, too")
         self._check_range(0, MAX_STEPS, "generations")
@@ -368,8 +377,8 @@ class DqnSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or bool(so_far["converged"]) or 0 < self.episodes <= int(so_far["episodes"])
 
-    def check(self) -> None:
-        super().check()
+    def check(self, sim: SimConfig | None = None) -> None:
+        super().check(sim)
         if PolicySpec.parse(self.policy).actions == "continuous":
             raise GridSimError(f"policy {self.policy}: the DQN chooses among the eight actions; leave out {CONTINUOUS}")
         self._check_range(1, MAX_STEPS, "evaluate_every", "batch", "anneal", "target_period")

@@ -11,7 +11,7 @@ HARSH = 5.0  # m2/s4, mean square of the lateral acceleration that costs everyth
 WEIGHT = 0.2
 
 
-def soft(results: np.ndarray, targets: np.ndarray | float) -> np.ndarray:
+def soft(results: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Scores [members] of results [members, episodes]: the usual fitness, less what is harsh, of which those
     who drive far are charged most.
     """

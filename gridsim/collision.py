@@ -18,8 +18,8 @@ _OUTLINE = np.array(
     dtype=np.float32,
 )
 _OUTLINE.setflags(write=False)
-# Least distance (m) between points of the outline that are checked on maps with thin walls. A right-angled corner of a
-# wall that reaches into the car by less than half this distance may be missed.
+# Least distance (units) between points of the outline that are checked on maps with thin walls. A right-angled corner
+# of a wall that reaches into the car by less than half this distance may be missed.
 _OUTLINE_STEP = F(0.1)
 
 
@@ -37,7 +37,7 @@ def _outline_leaves_road(road, length, width, x, y, cosine, sine):
             free = clearance(road, x0 + at * cosine, y0 + at * sine)
             if free < ZERO:
                 return True
-            at += max(free, _OUTLINE_STEP)
+            at += max(free, _OUTLINE_STEP * road.unit)
         length, width, cosine, sine = width, length, -sine, cosine
     return False
 

@@ -248,7 +248,7 @@ class SimConfig:
         for name, *ends in self.randomise:
             _check_names("randomise.", {name: ends}, list(LIMITS["vehicle"]))
             least, most = (number(end, f"randomise.{name}", *LIMITS["vehicle"][name]) for end in ends)
-            if least > most:
+            if not least <= most < math.inf:
                 raise GridSimError(f"randomise.{name} must be least and most, not {least:g} and {most:g}")
             for length in (least, most) if name == "length" else ():
                 if replace(self, vehicle=replace(self.vehicle, length=length)).unit != self.unit:

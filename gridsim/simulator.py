@@ -13,7 +13,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import ZERO, F, I, leaf, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.imperfections import History, imperfections_of, late_command
+from gridsim.sensing.imperfections import Delays, History, late_command, new_history
 from gridsim.sensing.observation import encoding
 from gridsim.sensing.route import check_lanes
 from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
@@ -154,11 +154,7 @@ class Simulator:
         self._physics: Physics | None = None  # None: made when a kernel needs it next
         self._starts = np.zeros((cars, POSE), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
-        delays, rays = imperfections_of(self.config)[1], self.config.sensors.rays
-        self._histories = delays and (
-            np.zeros((cars, delays.readings, 2, rays), dtype=np.float32),
-            np.zeros((cars, delays.commands, 2), dtype=np.float32),
-        )
+        self._histories: dict[Delays, tuple[np.ndarray, np.ndarray]] = {}  # of all cars, for each length that one has
         self.maps: dict[int, Map] = {}  # the map of each car that was reset
         self._row_of: dict[Map, int] = {}  # row of each map in the atlas
         self._rows = np.full(cars, -1)  # row of each car's map in the atlas
@@ -204,16 +200,22 @@ class Simulator:
         self._starts[cars] = starts[:, :POSE]
         self._drawn = {i: drawn for i, drawn in self._drawn.items() if i not in cars}
         for batch in self._batches(cars):
-            _place_all(*batch, cars, starts, *self._arrays())
+            _place_all(*batch, cars, starts, *self._arrays(batch[0]))
 
     def forget_maps(self) -> None:
         """Have the next reset remove maps on which there are no cars."""
         self._row_of = {}
 
-    def _arrays(self) -> tuple[Any, ...]:
-        """State of all cars as kernels read it; worlds are None without traffic."""
+    def _arrays(self, physics: Physics) -> tuple[Any, ...]:
+        """State of all cars as kernels read it; worlds are None without traffic, histories without delays."""
         worlds, seen = self.worlds if self.worlds.shape[1] else None, (self.ranges, self.closing, self.observations)
-        return self.cars, self.visits, worlds, seen, self._histories
+        histories, delays = None, Simulation(None, None, *physics[1]).delays
+        if delays:
+            if delays not in self._histories:
+                shapes = (len(self), delays.readings, 2, self.ranges.shape[1]), (len(self), delays.commands, 2)
+                self._histories[delays] = np.zeros(shapes[0], np.float32), np.zeros(shapes[1], np.float32)
+            histories = self._histories[delays]
+        return self.cars, self.visits, worlds, seen, histories
 
     def _batches(self, cars: np.ndarray | None = None) -> Iterator[tuple[Physics, np.ndarray, np.ndarray]]:
         """Split cars [k], by default all, into batches with the same physics; each randomised vehicle is a batch.
@@ -228,7 +230,7 @@ class Simulator:
             return
         for k, i in enumerate(range(len(self)) if cars is None else cars.tolist()):
             if i not in self._drawn:
-                self._drawn[i] = parameters(self.config.drawn(self._starts[i]), self.features)
+                self._drawn[i] = parameters(self.config, self.features, self._starts[i])
             yield (self._physics[0], self._drawn[i]), np.array([k]), np.array([[self._rows[i], 0, 1]])
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
@@ -263,26 +265,34 @@ class Simulator:
         rewards = np.zeros(len(self), dtype=np.float32)
         limits = np.float32(self.target), self.max_steps
         for batch in self._batches():
-            _control_all(*batch, actions, limits, self.ends, rewards, *self._arrays())
+            _control_all(*batch, actions, limits, self.ends, rewards, *self._arrays(batch[0]))
         return rewards
 
 
 @njit
 def _views(simulation, cars, worlds, closing, ranges, observations):
+    history = new_history(simulation.delays, ranges.shape[1])
     for i in range(cars.shape[0]):
-        look(simulation, cars[i], worlds[i], ranges[i], closing, observations[i], None)
+        look(simulation, cars[i], worlds[i], ranges[i], closing, observations[i], history)
 
 
 def views(
-    scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig, features: tuple[str, ...] = ()
+    scenario: Map,
+    cars: np.ndarray,
+    worlds: np.ndarray,
+    config: SimConfig,
+    features: tuple[str, ...] = (),
+    start: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS], without latency.
+    """What a car sees in states [n, CAR_FIELDS] among traffic [n, others, TRAFFIC_FIELDS].
 
+    If readings come late, the states must be those of one drive, step by step from its start; else they may be any.
+    `start`: of the drive, if its vehicle is drawn.
     Returns: ranges (m) of the rays, float32 [n, rays], and observations with these features, float32 [n, values].
     """
     if len(cars) != len(worlds):
         raise ValueError(f"each of {len(cars)} states needs its own traffic, not {len(worlds)} of them")
-    simulation = simulations_on([scenario], config, features)[0]
+    simulation = simulations_on([scenario], config, features, start)[0]
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     observations = np.empty((len(cars), simulation.encoding.first[-1]), dtype=np.float32)
     closing = np.zeros(config.sensors.rays * ("motion" in features), dtype=np.float32)

@@ -68,18 +68,28 @@ class Simulation(NamedTuple):
     encoding: Encoding
 
 
-def parameters(config: SimConfig, features: tuple[str, ...] = ()) -> tuple[Any, ...]:
-    """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
-    k, model = constants(config), MODELS[config.vehicle.model].parameters(config.vehicle)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(config), rays, model, *imperfections_of(config), encoding(features, k)
+def parameters(config: SimConfig, features: tuple[str, ...] = (), start: np.ndarray | None = None) -> tuple[Any, ...]:
+    """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration.
+
+    Args: `start`, the start of the episode whose vehicle is drawn (`SimConfig.drawn`); None: the configuration's own.
+    Observations have the configuration's scales, whatever is drawn.
+    """
+    own = config if start is None else config.drawn(start)
+    k, model = constants(own), MODELS[own.vehicle.model].parameters(own.vehicle)
+    rays = fan(own.sensors.rays, k.ray_first, k.ray_step)
+    return k, drivers(own), rays, model, *imperfections_of(own), encoding(features, constants(config))
 
 
-def simulations_on(road_maps: Sequence[Map], config: SimConfig, features: tuple[str, ...] = ()) -> list[Simulation]:
-    """A Simulation for each map. Raises: GridSimError if a route is to be followed on a map without lanes."""
+def simulations_on(
+    road_maps: Sequence[Map], config: SimConfig, features: tuple[str, ...] = (), start: np.ndarray | None = None
+) -> list[Simulation]:
+    """A Simulation for each map; arguments as of `parameters`.
+
+    Raises: GridSimError if a route is to be followed on a map without lanes.
+    """
     for each in road_maps:
         check_lanes(each, features)
-    shared = parameters(config, features)
+    shared = parameters(config, features, start)
     return [Simulation(each.road, each.network, *shared) for each in road_maps]
 
 

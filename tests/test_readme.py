@@ -16,7 +16,7 @@ COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --p
 HERE = {
     "make evolve": f"{SMALL} --name first",
     'make dqn ARGS="--seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --name other",
-    ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 6e7": "--car-steps 100000",
+    ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 1.2e8": "--car-steps 100000",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",
     "make compare ARGS=--quick": f"{COMPARISON} quick",
     "make compare": f"{COMPARISON} whole",

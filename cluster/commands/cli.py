@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -42,16 +43,15 @@ from cluster.commands.progress import RunDisplay
 from cluster.commands.tables import driving_table, errors_table, stress_table
 from cluster.compare.results import series
 from cluster.report import stress, suite
-from cluster.run import Place, Session, train
+from cluster.run import Place, Session, send, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
 from cluster.stopping import INTERRUPTED
 from cluster.store.champion import Champion, drives, load_champion
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, SUMMARY, CheckpointError, write_json
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError, write_json
 from cluster.store.folder import PAGE, RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
-from cluster.tracking.description import read_run
-from cluster.tracking.tracking import saved_run_id, saved_uri, sync
+from cluster.tracking.tracking import saved_uri
 from cluster.workers.address import cluster_address
 from evolution.episodes.figures import summarise
 from evolution.networks.policy import PolicySpec
@@ -191,7 +191,10 @@ def _prepare(prog: str, arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
         if ours != theirs:
             raise GridSimError(f"--init {init} is a {champion.policy}; use --policy {champion.policy}")
         digest = champion.sha256
+        if base and init == base.run.init and digest != json.loads(Path(source).read_bytes()).get("init_sha256"):
+            raise GridSimError(f"--init {init} is not what it was for {source}; put it back, or start a new run")
     place = Path(flags.work.output), flags.run.name
+    init = os.path.abspath(init) if init else ""  # config.json may be read from another folder
     return flags, new_run(*place, settings, init, digest, may_exist=flags.run.resume_if_exists)
 
 
@@ -256,8 +259,6 @@ def _learn(prog: str) -> int:
     if not (run.path / CHECKPOINT).is_file():
         hint = ""
         with contextlib.suppress(OSError):
-            for name in (CONFIG, STEPS):
-                (run.path / name).unlink(missing_ok=True)
             run.path.rmdir()
     if problem:
         fail(prog, problem, hint, FAILED)
@@ -268,15 +269,13 @@ def _learn(prog: str) -> int:
 def _send_missing(console: Console, run: RunFolder, meta: Mapping[str, Any], work: WorkFlags) -> int:
     """Send to MLflow what it lacks of a finished run, and say how to go on."""
     settings = run.settings
-    sent, unsent = sync(run.path, work.tracking_uri, work.experiment, read_run)
-    if sent:  # if MLflow was away as the run ended, the summary lacks the id
-        summary = json.loads((run.path / SUMMARY).read_bytes())
-        write_json(run.path / SUMMARY, summary | {"mlflow_run_id": saved_run_id(run.path)})
+    sent, unsent = send(run, work.tracking_uri, work.experiment)
     done = f"sent to MLflow: {sent}" if sent else "nothing to do"
     limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
     more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""
-    if meta["solved"]:
-        more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
+    if meta["solved"] or meta.get("converged"):
+        how = "solved" if meta["solved"] else "done, as its network no longer changes (--converged)"
+        more = f" It is {how}; to go on from its champion, start a run with --init {short_path(run.path)}."
     steps = count(meta[settings.step_name], settings.step_name)
     console.print(f"{short_path(run.path)} is finished: {steps}; {done}.{more}", soft_wrap=True)
     if unsent:
@@ -319,10 +318,11 @@ def _evaluate() -> int:
     driven = list(drives(champion, *chosen))
     roads = {label(road): summarise(results, episode.control_period) for road, _, results in driven}
     figures = summarise(np.concatenate([results for _, _, results in driven]), episode.control_period)
-    missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
+    compared = series(champion, *chosen) if flags.errors else []
+    missed = errors(compared, champion.sim.vehicle) if compared else None
     place = Path(flags.champion)
     picture = (place if place.is_dir() else place.parent) / stress.PICTURE
-    found = _stress(champion, chosen, picture, flags) if flags.stress else []
+    found = _stress(champion, chosen, flags) if flags.stress else []
     if flags.json:
         more: dict[str, Any] = {"by_road": roads} if len(roads) > 1 else {}
         if missed is not None:
@@ -332,15 +332,20 @@ def _evaluate() -> int:
                 {"what": f"{each.part}.{each.name}", "level": level, **driven} for each, level, driven in found
             ]
         print(json.dumps({**figures, **more}))
-        return 0
-    crowds, title = [cars for _, cars, _ in driven], f"{flags.champion} on {', '.join(roads)}"
-    title += f", {crowds[0]} cars" if crowds[0] and len(roads) == 1 else ""
-    title += "" if is_map_file(driven[0][0]) else f", maps from seed {flags.seed:,}"
-    new_console().print(driving_table(title, figures, roads, crowds, episode.target))
-    if missed is not None:
-        new_console().print(errors_table("Errors against the reference driver", missed))
-    if found:
-        new_console().print(stress_table(found), f"picture: {short_path(picture)}", sep="\n", soft_wrap=True)
+    else:
+        crowds, title = [cars for _, cars, _ in driven], f"{flags.champion} on {', '.join(roads)}"
+        title += f", {crowds[0]} cars" if crowds[0] and len(roads) == 1 else ""
+        title += "" if is_map_file(driven[0][0]) else f", maps from seed {flags.seed:,}"
+        new_console().print(driving_table(title, figures, roads, crowds, episode.target))
+        if missed is not None:
+            new_console().print(errors_table("Errors against the reference driver", missed))
+        if found:
+            new_console().print(stress_table(found), f"picture: {short_path(picture)}", sep="\n", soft_wrap=True)
+    if flags.errors and missed is None:
+        text = "no drive is long enough to be compared with the reference driver"
+        print(f"gridsim-evaluate: warning: {text}", file=sys.stderr)
+    if found:  # last, so that figures are shown even if this fails
+        stress.draw(found, f"{flags.champion} on {label(name)}", picture)
     return 0
 
 
@@ -370,17 +375,13 @@ def _evaluate_suite(flags: EvaluateFlags) -> int:
     return 0
 
 
-def _stress(
-    champion: Champion, chosen: tuple[str, int, int, Traffic | None], picture: Path, flags: EvaluateFlags
-) -> list[Any]:
-    """Drive a champion at each level of each stress, draw its success to `picture`, and return what was measured."""
+def _stress(champion: Champion, chosen: tuple[str, int, int, Traffic | None], flags: EvaluateFlags) -> list[Any]:
+    """Drive a champion at each level of each stress. Returns what was measured."""
     asked = stress.stresses(champion)
     drives = stress.drive(champion, asked, *chosen)
     total = sum(len(each.levels) for each in asked)
     shown = new_console(stderr=True)
-    found = list(track(drives, "driving under stress", total, console=shown, transient=True, disable=flags.json))
-    stress.draw(found, f"{flags.champion} on {label(chosen[0])}", picture)
-    return found
+    return list(track(drives, "driving under stress", total, console=shown, transient=True, disable=flags.json))
 
 
 evolve_main, dqn_main = (partial(main, prog, partial(_learn, prog)) for prog in FLAGS)

@@ -33,6 +33,8 @@ class MapFlags:
     a scenario. FILE@left or FILE@right: the side of the road, where the file does not say it rightly."""
     crop: Annotated[str, IN_WORDS] = ""
     """Read only a square: LAT,LON,METRES of its middle and its side; X,Y,METRES where a file is in metres."""
+    sim: str = "default"
+    """For which car: default, f1tenth, sedan, truck, lights, or a YAML file (docs/own.md)."""
     output: Annotated[str, IN_WORDS] = ""
     """Draw it to this .png."""
 
@@ -50,31 +52,31 @@ def _map() -> int:
     files = files_of(name)
     if flags.output and len(files) > 1:
         raise GridSimError(f"--output: name one of the {len(files)} files, not all")
+    config = SimConfig.load(flags.sim)
     for file in files:
-        _describe(file)
+        _describe(file, config)
     if len(files) > 1:
         for what, part in zip(("learn on", "choose the champion on", "judge it on"), divided(name), strict=True):
             print(f"to {what}: {', '.join(Path(file).name for file in part)}")
     if flags.output:
         from cluster.report.pictures import road_map
 
-        road_map(build(name, 0), Path(flags.output), label(name))
+        road_map(build(name, 0, config), Path(flags.output), label(name))
         print(f"picture: {short_path(Path(flags.output))}")
     if is_map_file(name):
-        print(f"train a driver: gridsim-evolve --scenario {shlex.quote(name)}")
+        car = "" if flags.sim == "default" else f" --sim {shlex.quote(flags.sim)}"
+        print(f"train a driver: gridsim-evolve --scenario {shlex.quote(name)}{car}")
     return 0
 
 
-def _describe(name: str) -> None:
+def _describe(name: str, config: SimConfig) -> None:
     """Print what a scenario's map or a file holds, and what was noted as a file was read."""
-    config = SimConfig()
     here = build(name, 0, config)
     road, network = here.road, here.network
     is_road = is_map_file(name) and has_lanes(name)
     if is_road:
         found = described(name, config)
         print(f"{split_name(name)[0]}: {found.format}", *(f"  {note}" for note in found.notes), sep="\n")
-        print(f"  the map's lower left corner is the file's x {found.origin[0]:g} m, y {found.origin[1]:g} m")
     if len(network.steps):
         side, other = ("right", "left") if network.hand > 0.0 else ("left", "right")
         side += f" (if that is wrong: FILE@{other})" if is_road else ""

@@ -240,11 +240,12 @@ def _title(drive: Recording, name: str) -> str:
 def _page(flags: WatchFlags, output: Path, limit: float) -> None:
     """Write a page: drives of all sources from the same start, on the same road."""
     shown: list[Shown] = []
-    sources = (flags.source, *flags.beside)
+    sources, asked = (flags.source, *flags.beside), flags
     for source in sources:
         path = Path(source).resolve()
         of = path.parent.name if path.name == CHAMPION else path.name
-        for k, (found, name) in enumerate(_drives(dataclasses.replace(flags, source=source), limit), 1):
+        given = asked if _is_recording(source) else flags  # a recording has its own road
+        for k, (found, name) in enumerate(_drives(dataclasses.replace(given, source=source), limit), 1):
             mark = str(k) if not flags.beside else of if k == 1 else f"{of} {k}"
             shown.append(Shown(f"{name} of {source}", mark, found))
             if not _is_recording(source):  # the sources after it drive on the same road, among as many cars

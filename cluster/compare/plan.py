@@ -110,7 +110,8 @@ class Plan:
             name = flag.replace("-", "_")
             if name in PLANNED or name not in usual:
                 what = f"{learner} has no such setting, or the comparison sets it"
-                raise GridSimError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
+                remedy = "vary another one, or give --learners that all have it, as in --learners evolution"
+                raise GridSimError(f"--grid {text:.80}: {what}; {remedy}")
             kind = type(usual[name])
             words = re.split(",(?=[a-z])" if kind is str else ",", values)  # mlp:6,7 is one word
             try:

@@ -57,16 +57,23 @@ def group(runs: Sequence[Run], plan: Plan | None = None) -> Groups:
         s = run.settings
         of_learner.setdefault((s.scenario, s.traffic, s.learner, s.observation), []).append(run)
     groups: Groups = {}
+    roads = _names_of_roads(runs)
     for (scenario, traffic, learner, observation), alike in of_learner.items():
         several_traffics = len({other for name, other, *_ in of_learner if name == scenario}) > 1
         several_observations = len({other for *_, other in of_learner}) > 1
-        road = label(scenario) + (f", {cars(traffic)}" if several_traffics else "")
+        road = roads[scenario] + (f", {cars(traffic)}" if several_traffics else "")
         words = NAMES[learner] + (f" on {observation}" if several_observations else "")
         varied = [name for name in vars(alike[0].settings) if len({getattr(run.settings, name) for run in alike}) > 1]
         for run in alike:
             own = [f"{name} {getattr(run.settings, name)}" for name in varied if name not in LIMITS]
             groups.setdefault((road, ", ".join([words, *own])), []).append(run)
     return groups
+
+
+def _names_of_roads(runs: Sequence[Run]) -> dict[str, str]:
+    """The name of each scenario: its label, or all of it where two scenarios have the same label."""
+    labels = {scenario: label(scenario) for scenario in {run.settings.scenario for run in runs}}
+    return {name: short if [*labels.values()].count(short) == 1 else name for name, short in labels.items()}
 
 
 def quartiles(runs: Sequence[Run], figure: str) -> tuple[list[float], tuple[float, float, float]]:
@@ -94,11 +101,12 @@ def table(groups: Groups, columns: Columns, spread: bool = True) -> list[list[st
 def table_csv(groups: Groups, folder: Path) -> bytes:
     """A line for each run, without rounding; a missing run has no figures. Paths are relative to `folder`."""
     lines: list[dict[str, object]] = []
+    roads = _names_of_roads([run for runs in groups.values() for run in runs])
     for (_, learner), runs in groups.items():
         for run in runs:
             s, figures = run.settings, {**dict.fromkeys((*RUN_FIGURES, *ERROR_FIGURES), math.nan), **run.figures}
             lines.append({
-                "scenario": label(s.scenario), "traffic": s.traffic, "observation": s.observation,
+                "scenario": roads[s.scenario], "traffic": s.traffic, "observation": s.observation,
                 "learner": s.learner, "variant": learner.partition(", ")[2], "seed": s.seed,
                 **{name: value if math.isfinite(value) else "" for name, value in figures.items()},
                 "champion_sha256": run.champion_sha256,

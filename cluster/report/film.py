@@ -42,10 +42,10 @@ class Recording:
 
     scenario: Map
     cars: np.ndarray  # float32 [steps + 1, CAR_FIELDS], the car's states (`gridsim.state`)
-    ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
+    ranges: np.ndarray  # float32 [steps + 1, rays], the readings of its rays, m, late ones if there is a latency
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how the drive ended; RUNNING if the recording was stopped first, and for any drive by a person
-    sim: SimConfig  # the simulator's parameters during the drive
+    sim: SimConfig  # the simulator's parameters during the drive; of a champion with the vehicle drawn for it
     outputs: np.ndarray | None = None  # float32 [steps + 1, 8 or 2], a perceptron's outputs; None for other drivers
 
     @property
@@ -72,16 +72,16 @@ def record(
     Args: `start`, a pose float32 [5], or [8] (`state.START_FIELDS`); `world` float32 [others, TRAFFIC_FIELDS], the
     traffic at the start; None: no other cars.
     """
-    episode, spec = champion.sim.episode, PolicySpec.parse(champion.policy)
+    sim, episode, spec = champion.sim, champion.sim.episode, PolicySpec.parse(champion.policy)
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
     start, goal = np.asarray(start, dtype=np.float32), episode.target
-    result, cars, worlds = trajectory(spec, champion.genome, scenario, start, goal, steps, champion.sim, world)
+    result, cars, worlds = trajectory(spec, champion.genome, scenario, start, goal, steps, sim, world)
     end = End(int(result["end"]))
     if end == End.TIME and steps < episode.steps:
         end = End.RUNNING
-    ranges, seen = views(scenario, cars, worlds, champion.sim, spec.features)
-    outputs = outputs_of(spec, champion.genome, seen, champion.sim) if isinstance(spec, MlpSpec) else None
-    return Recording(scenario, cars, ranges, other_cars(worlds), end, champion.sim, outputs)
+    ranges, seen = views(scenario, cars, worlds, sim, spec.features, start)
+    outputs = outputs_of(spec, champion.genome, seen, sim) if isinstance(spec, MlpSpec) else None
+    return Recording(scenario, cars, ranges, other_cars(worlds), end, sim.drawn(start), outputs)
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:
@@ -107,10 +107,11 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
     boxes = interpolate(drive.boxes[k], drive.boxes[following], part, drive.scenario) if drive.boxes.shape[1] else None
     ranges, then = drive.ranges[k], drive.ranges[following]
     # A ray that jumps from one object to another is shown on one of the two, never between them.
-    ranges = np.where(np.abs(then - ranges) < 3.0, ranges + part * (then - ranges), ranges if part < 0.5 else then)
+    same = np.abs(then - ranges) < 3.0 * drive.scenario.road.unit
+    ranges = np.where(same, ranges + part * (then - ranges), ranges if part < 0.5 else then)
     path = np.concatenate([drive.cars[: k + 1, [X, Y]], car[None, [X, Y]]])
-    minutes, rest = divmod(min(seconds, drive.seconds), 60)
-    text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {minutes:.0f}:{rest:04.1f}"
+    minutes, tenths = divmod(round(10 * min(seconds, drive.seconds)), 600)
+    text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {minutes}:{tenths / 10:04.1f}"
     if drive.end != End.RUNNING and seconds >= drive.seconds - 1e-9:
         text += f"    {drive.end.name.lower()}"
     route = drive.route[k] + part * drive.scenario.shortest(drive.route[following] - drive.route[k])
@@ -118,10 +119,15 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
 
 
 def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") -> Iterator[np.ndarray]:
-    """Pictures uint8 [h, w, 3] of a whole drive: `fps` for each second of it, and at least one. Raises Stopped."""
-    for k in range(max(1, round(drive.seconds * fps))):
+    """Pictures uint8 [h, w, 3] of a whole drive: `fps` for each second of it, and at least one. Raises Stopped.
+
+    The last one shows how the drive ended, if it did.
+    """
+    count = max(1, round(drive.seconds * fps))
+    for k in range(count):
         stopping.check()
-        yield picture(renderer, drive, k / fps, title)
+        ends = k == count - 1 and drive.end != End.RUNNING
+        yield picture(renderer, drive, drive.seconds if ends else k / fps, title)
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:

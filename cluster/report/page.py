@@ -3,8 +3,9 @@
 Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel,
 one column per moment; the differences from each moment to the next are compressed. Positions are in 65,536ths of the
 map's sides and headings in 65,536ths of a turn, so that both wrap as the torus and the angle do. Rays are in
-hundredths of a unit (`SimConfig.unit`), speeds in cm/s, new ground in dm, and outputs as shares of 65,535. Outside the
-table, lengths are in units and speeds in m/s.
+hundredths of a unit (`SimConfig.unit`), speeds in cm/s, new ground in dm, and outputs as shares of 65,535. New ground
+may be more than 16 bits hold: it never falls, so that the script adds its differences up without wrapping. Outside
+the table, lengths are in units and speeds in m/s.
 """
 
 from __future__ import annotations

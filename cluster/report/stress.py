@@ -25,10 +25,21 @@ class Stress(NamedTuple):
     share: bool = False  # whether levels are factors on the champion's own number
 
     def at(self, level: float, sim: SimConfig) -> SimConfig:
-        """The configuration `sim` with this number set to a level, or if `share` to that multiple of its value."""
-        part = getattr(sim, self.part)
-        value = level * getattr(part, self.name) if self.share else level
-        return dataclasses.replace(sim, **{self.part: dataclasses.replace(part, **{self.name: value})})
+        """The configuration `sim` with this number, and its range in `randomise`, set to a level, or if `share` to that
+        multiple.
+        """
+
+        def worse(value: float) -> float:
+            return level * value if self.share else level
+
+        part, randomise = getattr(sim, self.part), sim.randomise
+        if self.part == "vehicle":
+            randomise = tuple(
+                (name, worse(least), worse(most)) if name == self.name else (name, least, most)
+                for name, least, most in sim.randomise
+            )
+        part = dataclasses.replace(part, **{self.name: worse(getattr(part, self.name))})
+        return dataclasses.replace(sim, **{self.part: part}, randomise=randomise)
 
 
 STRESSES = (

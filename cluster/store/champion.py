@@ -28,7 +28,7 @@ from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.parts import HELD_OUT_SEED, roads_of, seed_of_map
-from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name
+from gridsim.maps.scenarios import AMOUNTS, Traffic, build, check_name, crowds, full_name, has_lanes
 
 SIM_FORMAT = 2  # of `sim` in a champion.npz; format 1 has patience in control steps, progress in m per control step
 GONE = ("apart", "kerb")  # traffic parameters of format 1 that no longer exist
@@ -104,14 +104,15 @@ class Champion:
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
         """A Gymnasium environment (`GridSimEnv`) that suits the champion, on its scenario or another.
 
-        `options` are further arguments of the environment; they override those that the champion decides.
+        `options` are further arguments of the environment; they override those that the champion decides. With a
+        `config`, it is the environment of `in_sim(config)`.
         """
         from gridsim.envs.env import GridSimEnv
 
         scenario = full_name(scenario or self.scenario)
-        spec = PolicySpec.parse(self.policy)
-        own: dict[str, Any] = {"observation": spec.observation, "traffic": self.crowds_on(scenario)}
-        own["config"] = self.sim
+        spec, driver = PolicySpec.parse(self.policy), self.in_sim(options.pop("config", None))
+        own: dict[str, Any] = {"observation": spec.observation, "traffic": driver.crowds_on(scenario)}
+        own["config"] = driver.sim
         own |= {name: value for name, value in vars(spec).items() if name not in ("hidden", "features")}
         own |= dict.fromkeys(spec.features, True)
         return GridSimEnv(scenario=scenario, **own | options)
@@ -232,6 +233,8 @@ def held_out(
     for road, cars in zip(roads_of(name), champion.crowds_on(name, traffic), strict=True):
         if not 0 <= cars <= MAX_TRAFFIC:
             raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {cars}")
+        if cars and not has_lanes(road):
+            raise GridSimError(f"traffic: {road} has no lanes for it; use 0 cars")
         same = {k: seed_of_map(road, k) for k in seeds}
         maps = {k: build(road, k, champion.sim) for k in dict.fromkeys(same.values())}
         chosen = spread_starts(lambda k: maps[same[k]], seeds, episodes, (cars,), champion.sim)  # noqa: B023

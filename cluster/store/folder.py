@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
-import functools
 import hashlib
 import json
 import os
@@ -116,19 +115,30 @@ def _sources(settings: RunSettings) -> dict[str, str]:
     return found
 
 
-@functools.cache  # a second call with the same path does nothing: this process has the lock
+_locked = set[tuple[int, int]]()  # folders that this process has locked, by device and inode
+
+
 def lock(path: Path) -> None:
-    """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
+    """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError.
+
+    Locking it again does nothing, whatever it is called then.
+    """
     try:
         path.mkdir(parents=True, exist_ok=True)
         folder = os.open(path, os.O_RDONLY)
     except OSError as error:
         raise RunError(f"--output: {path} cannot be made: {error.strerror}; choose another folder") from error
+    found = os.fstat(folder)
+    if (found.st_dev, found.st_ino) in _locked:
+        os.close(folder)
+        return
     with contextlib.suppress(OSError):  # NFS cannot lock folders
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            os.close(folder)
             raise RunError(f"{path}: another process is at work on it; wait for it, or stop it") from None
+    _locked.add((found.st_dev, found.st_ino))
 
 
 def open_run(folder: Path) -> RunFolder:
@@ -170,7 +180,7 @@ def new_run(
 
 
 def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> Path:
-    """The folder of a new run or comparison, checked but not yet made.
+    """The folder of a new run or comparison, checked but not yet made; it may be there if it is empty.
 
     Args: `name`, "" to name it by `kind` and time; `may_exist` as for `new_run`. Raises: RunError.
     """
@@ -179,7 +189,8 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name
-    if path.exists() and not (may_exist and path.is_dir() and {p.name for p in path.glob("[!.]*")} <= BEGUN):
+    allowed = BEGUN if may_exist else set[str]()
+    if path.exists() and not (path.is_dir() and {p.name for p in path.glob("[!.]*")} <= allowed):
         again = f"continue it with --resume {as_argument(path)}"
         raise RunError(f"{path} exists already; choose another --name, or {again}")
     return path.absolute()

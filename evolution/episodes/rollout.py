@@ -25,7 +25,7 @@ from gridsim.jit import ZERO, F, I, U, exact, freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.imperfections import History, late_command, new_history
-from gridsim.sensing.observation import normalise
+from gridsim.sensing.observation import OWN_SPEED, normalise
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
 from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
@@ -162,8 +162,8 @@ def _observe(simulation, car, world, workspace, grid_buffers):
 
 @exact
 def _observed_speed(simulation, observation):
-    """The speed (m/s) that a network on the grid sees: the observation's last value times `vehicle.speed_limit`."""
-    return observation[observation.shape[0] - 1] * simulation.constants.speed_limit
+    """The speed (m/s) that a network on the grid sees: the observation's last value times its full scale."""
+    return observation[observation.shape[0] - 1] * simulation.encoding.full[OWN_SPEED]
 
 
 @leaf
@@ -352,7 +352,7 @@ def evaluate(
     for column, episode in enumerate(episodes):
         simulation = simulations[episode["map"]]
         if config.randomise:
-            simulation = simulations_on([road_maps[episode["map"]]], config.drawn(episode["start"]), spec.features)[0]
+            simulation = simulations_on([road_maps[episode["map"]]], config, spec.features, episode["start"])[0]
         setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
         traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
         row = kept[column]
@@ -395,7 +395,7 @@ def collect(
         m = int(episodes["map"][which[0]])
         simulation = simulations[m]
         if config.randomise:
-            simulation = simulations_on([road_maps[m]], config.drawn(episodes["start"][group]), spec.features)[0]
+            simulation = simulations_on([road_maps[m]], config, spec.features, episodes["start"][group])[0]
         _collect(simulation, weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results)
     driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
     return Experience(*(array[driven] for array in experience)), results
@@ -417,7 +417,7 @@ def trajectory(
     Returns: (RESULT []; the car's states before each driven step and at the end, float32 [driven + 1, CAR_FIELDS]; the
     traffic at the same times, float32 [driven + 1, cars, TRAFFIC_FIELDS]).
     """
-    simulation = simulations_on([road_map], config.drawn(start), spec.features)[0]
+    simulation = simulations_on([road_map], config, spec.features, start)[0]
     cars = 0 if world is None else len(world)
     grid_buffers, command = policy_buffers(spec, config)
     workspace = make_workspace(simulation, spec.layers, steps + 1, cars, command)

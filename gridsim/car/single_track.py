@@ -8,7 +8,8 @@ centre of mass and its distances lf and lr to the axles, the yaw rate and the sl
     b' = mu / (v L) ((lr R - lf F) w / v - (R + F) b + F d) - w
 
 where F = C_f (g lr - a h) and R = C_r (g lf + a h) are the axles' stiffnesses under load, and L = lf + lr. Where
-|v| is below KINEMATIC_BELOW, the equations would divide by almost 0: there, w and b are the kinematic bicycle's.
+v is below KINEMATIC_BELOW, the equations would divide by almost 0, and in reverse they are unstable: there, w and b are
+the kinematic bicycle's.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def move(model, constants, car, curvature, x, y, cosine, sine, speed, accelerati
     length = ZERO
     for _ in range(parts):
         middle = speed + HALF * h * acceleration
-        if abs(middle) < KINEMATIC_BELOW:
+        if middle < KINEMATIC_BELOW:
             tangent = rear / base * math.tan(steering)
             slip_after = math.atan(tangent)
             rate_after = middle * math.sin(slip_after) / rear

@@ -44,7 +44,7 @@ from gridsim.envs.draws import Draws
 from gridsim.envs.observing import Observer, row
 from gridsim.jit import U
 from gridsim.maps.map import Map
-from gridsim.maps.parts import TRAINING_SEED
+from gridsim.maps.parts import TRAINING_SEED, roads_of
 from gridsim.maps.scenarios import Traffic, check_name, crowds, full_name, has_lanes
 from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.sensing.observation import OPTIONAL
@@ -134,6 +134,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"{' and '.join(seen)}: only for rays; leave them out with observation={observation!r}")
         self.num_envs, self.config = num_envs, SimConfig.load(config or "default")
         cars = traffic if isinstance(traffic, tuple) else crowds(scenario, traffic, self.config)
+        if len(cars) != len(roads := roads_of(scenario)) or min(cars) < 0:
+            raise ValueError(f"traffic must be a number of other cars for each of {len(roads)} roads, not {traffic}")
         if not has_lanes(scenario) and (any(cars) or "route" in seen):
             raise ValueError(f"{scenario} has no lanes for traffic or a route; use traffic=0, and not route=True")
         self.autoreset_mode = AutoresetMode(autoreset_mode)

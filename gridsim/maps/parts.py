@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gridsim import ENVIRONMENTS
 from gridsim.config import names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -70,23 +71,24 @@ def is_map_file(name: str) -> bool:
 
     Any name with a dot or a separator of folders counts as a path; the file need not exist.
     """
-    return len(roads_of(name)) == 1 and (names_file(name) or glob.has_magic(name) or os.path.isdir(name))
+    own = name in ENVIRONMENTS.values()  # whatever folders there are: ./city is the folder
+    return len(roads_of(name)) == 1 and not own and (names_file(name) or glob.has_magic(name) or os.path.isdir(name))
 
 
 def files_of(name: str) -> list[str]:
     """The map files of a path, sorted: the file itself, all that match a pattern, or those of a folder.
 
-    A folder's pictures count only if no YAML file is there. Raises: GridSimError for a folder or a pattern with fewer
+    Pictures count only if there is no YAML file among them. Raises: GridSimError for a folder or a pattern with fewer
     than three.
     """
     if os.path.isdir(name):
         files = [os.path.join(name, file) for file in sorted(os.listdir(name))]
-        kinds = ROADS + (YAMLS if any(file.lower().endswith(YAMLS) for file in files) else PICTURES)
-        files = [file for file in files if Path(file).suffix.lower() in kinds]
     elif glob.has_magic(name) and not os.path.exists(name):
         files = sorted(glob.glob(name))
     else:
         return [name]
+    kinds = ROADS + (YAMLS if any(file.lower().endswith(YAMLS) for file in files) else PICTURES)
+    files = [file for file in files if Path(file).suffix.lower() in kinds]
     if len(files) < len(FIRST_SEEDS):
         raise GridSimError(
             f"{name}: {len(files)} map files; it needs 3 or more, one to learn on, one to choose the champion on, and "

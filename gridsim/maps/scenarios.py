@@ -80,7 +80,9 @@ def check_name(name: str) -> None:
     labels = [label(road) for road in roads]
     for road, short in zip(roads, labels, strict=True):
         if labels.count(short) > 1:
-            raise GridSimError(f"scenario {name}: {road if roads.count(road) > 1 else short} is there twice")
+            if roads.count(road) > 1:
+                raise GridSimError(f"scenario {name}: {road} is there twice")
+            raise GridSimError(f"scenario {name}: two of its roads have the name {short}; rename or copy a file")
 
 
 def label(name: str) -> str:

@@ -57,7 +57,8 @@ def features(k: Constants) -> tuple[Feature, ...]:
 USUAL = constants(SimConfig())
 FEATURES = features(USUAL)
 OPTIONAL = tuple(dict.fromkeys(feature.name for feature in FEATURES if feature.sees))
-ROUTE, MIRRORS = ([feature.name for feature in FEATURES].index(name) for name in ("route", "mirrors"))
+_NAMES = [feature.name for feature in FEATURES]
+OWN_SPEED, ROUTE, MIRRORS = _NAMES.index("speed"), _NAMES.index("route"), _NAMES.index("mirrors")
 
 
 class Encoding(NamedTuple):

@@ -125,7 +125,7 @@ def lane_change_steps(config: SimConfig) -> int:
 def check_traffic(cars: int, config: SimConfig) -> None:
     """Raises: GridSimError if there are other cars, but cars are too small for the lengths that traffic assumes."""
     if cars and config.unit < 1.0:
-        raise GridSimError(f"traffic is for cars of 2.9 m or more, not of {config.vehicle.length:g} m: use traffic 0")
+        raise GridSimError(f"traffic is for cars of 2.83 m or more, not of {config.vehicle.length:g} m: use traffic 0")
 
 
 def empty_worlds(episodes: int, cars: int) -> np.ndarray:

@@ -2,9 +2,13 @@
 
 import dataclasses
 import doctest
+import json
+import os
+import shutil
 
 import numpy as np
 import pytest
+import tracked
 from commands import refused
 
 import gridsim
@@ -106,6 +110,41 @@ def test_traffic_is_the_champions_the_roads_or_what_is_asked_for(champion, scena
     env = used_to_two.make_env(scenario, **asked)
     env.reset(seed=0)
     assert env.cars.simulator.worlds.shape[1] == cars
+    small = used_to_two.make_env(scenario, config="f1tenth")
+    assert small.cars.simulator.worlds.shape[1] == 0, "traffic is for usual cars"
+
+
+def test_a_folder_is_used_again_after_a_run_that_failed_was_deleted_or_belongs_to_it(here, monkeypatch):
+    once = dataclasses.replace(SMALL, generations=1)
+    with pytest.raises(GridSimError, match="ZeroDivisionError"):
+        evolve(once, fitness=lambda results, targets: 1 / 0, folder="r")
+    assert os.listdir("r") == []
+    first, _ = evolve(once, folder="r")
+    shutil.rmtree("r")
+    assert evolve(once, folder="r")[0].sha256 == first.sha256
+    (here / "below").mkdir()
+    monkeypatch.chdir("below")
+    assert len(evolve(SMALL, folder="../r", resume=True)[1]) == 2, "it is this process that has locked it"
+    with pytest.raises(GridSimError, match=r"^../r is a run of another learner, gridsim-evolve$"):
+        gridsim.train_dqn(scenario="curved", folder="../r", resume=True)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_finished_run_is_sent_to_mlflow_if_it_is_asked_for(here, uri):
+    evolve(SMALL, folder="r")
+    assert json.loads((here / "r/summary.json").read_text())["mlflow_run_id"] == ""
+    evolve(SMALL, folder="r", resume=True, tracking_uri=uri)
+    (logged,) = (each.info for each in tracked.runs(uri) if each.info.run_name == "r")
+    assert logged.status == "FINISHED"
+    assert json.loads((here / "r/summary.json").read_text())["mlflow_run_id"] == logged.run_id
+
+
+def test_paths_are_settings_and_a_configuration_is_told_to_be_none(here):
+    (here / "car.yaml").write_text("vehicle: {length: 4.5}")
+    settings = EvolveSettings(here / "lab.png", sim=here / "car.yaml")
+    assert (settings.scenario, settings.sim) == (str(here / "lab.png"), str(here / "car.yaml"))
+    with pytest.raises(GridSimError, match=r"^setting 'sim' must be a name or a file's path, not a SimConfig$"):
+        EvolveSettings(sim=SimConfig())
 
 
 def test_a_champions_traffic_is_its_runs():
@@ -148,6 +187,7 @@ def test_own_fitness_decides(champion):
     other, history = evolve(SMALL, fitness=early)
     assert {"distance", "paced", "steps", "end"} <= set(seen[0][0])
     assert seen[0][1][0] == 32
+    assert {goals == (shape[1],) for _, shape, goals in seen} == {True}, "targets of each episode"
     assert len(history) == 2
     assert set(history[-1]) == set(Evolution.columns)
     assert history[-1]["wall_s"] > history[0]["wall_s"] > 0.0

@@ -169,7 +169,7 @@ WRONG = [
     ("--scenario moon", "unknown scenario"),
     ("--sim f1tent", "unknown simulator 'f1tent'; did you mean f1tenth?"),
     ("--sim none.yaml", "none.yaml: No such file"),
-    ("--sim f1tenth --scenario city --traffic 3", "traffic is for cars of 2.9 m or more"),
+    ("--sim f1tenth --scenario city --traffic 3", "traffic is for cars of 2.83 m or more"),
     ("--workers -1", "--workers"),
     ("--patience -1", "--patience must be 0 or more"),
     ("--output /proc/nowhere", "--output"),
@@ -185,6 +185,7 @@ WRONG = [
     ("--init MADE/c.npz --policy mlp:6,7 --actions continuous", "has discrete actions, this run continuous ones"),
     ("--policy mlp:6,7+continuous --device cpu", "the DQN chooses among the eight actions"),
     ("--config MADE/config.json", "gone.npz"),
+    ("--config MADE/other/config.json", "c.npz is not what it was for"),
     ("--device cuda", "PyTorch finds no device 'cuda' here; use --device cpu"),
 ]
 
@@ -195,6 +196,9 @@ def made(tmp_path_factory):
     folder, genes = tmp_path_factory.mktemp("made"), np.zeros(PolicySpec.parse("mlp:6,7").size, dtype=np.float32)
     Champion(genes, "mlp:6,7", "curved", SimConfig()).save(folder / "c.npz")
     RunFolder(folder, EvolveSettings("curved"), init=str(folder / "gone.npz")).write_config()
+    (folder / "other").mkdir()
+    small = EvolveSettings("curved", policy="mlp:6,7")
+    RunFolder(folder / "other", small, init=str(folder / "c.npz"), init_sha256="0").write_config()
     return folder
 
 

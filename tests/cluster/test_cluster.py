@@ -17,7 +17,7 @@ import hosts
 import jsonschema  # type: ignore[import-untyped]
 import pytest
 import yaml
-from commands import BIN, all_in_mlflow, ray_workers, requirements, summary, wait_until
+from commands import BIN, all_in_mlflow, needed, ray_workers, requirements, summary, wait_until
 from hosts import HOME, Host
 
 from cluster.commands.cli import EvolveFlags
@@ -40,9 +40,9 @@ def kuberay(root: Path) -> dict[str, Any]:
     return {document["kind"]: document for document in yaml.safe_load_all(text)}
 
 
-def pinned(config: dict[str, Any]) -> dict[str, str]:
-    """Versions that a file's commands install, by name."""
-    text = " ".join(config["setup_commands"] + config["head_setup_commands"])
+def pinned(config: dict[str, Any], head: bool = True) -> dict[str, str]:
+    """Versions that a file's commands install, by name; without `head`, on workers."""
+    text = " ".join(config["setup_commands"] + config["head_setup_commands"] * head)
     return dict(re.findall(r"([a-z]+)(?:\[[a-z]+\])?==(\S+)", text))
 
 
@@ -71,7 +71,7 @@ def test_file_fits_rays_schema_and_gives_each_machine_the_project_and_the_token(
 def test_versions_are_those_that_the_project_asks_for(root: Path, name: str) -> None:
     wanted = {item.name: item for item in requirements("evolve")}
     versions = pinned(read(root, name))
-    assert set(versions) >= {"numpy", "numba", "scipy", "torch"}
+    assert set(versions) >= {"gymnasium", "numpy", "numba", "scipy", "torch"}
     assert [package for package, version in versions.items() if not wanted[package].specifier.contains(version)] == []
     assert versions == {package: pinned(read(root, "local"))[package] for package in versions}
     ray = pinned(read(root, "local"))["ray"]
@@ -126,7 +126,9 @@ class Machines:
         keep = [root, Path(sys.prefix), Path(sys.base_prefix), CACHE_FOLDER]
         self.laptop = stack.enter_context(contextlib.closing(hosts.switch(folder / "laptop", keep)))
         self.head = stack.enter_context(contextlib.closing(Host(folder / "head", keep)))
-        without = hosts.package_folders()
+        lacking = {item.name for item in requirements("evolve")} - needed(pinned(read(root, "local"), head=False))
+        assert {"mlflow", "pillow", "torch"} <= lacking
+        without = hosts.package_folders() | hosts.folders_of(lacking)
         self.worker = stack.enter_context(contextlib.closing(Host(folder / "worker", keep, without)))
         self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
         authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()

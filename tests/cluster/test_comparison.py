@@ -248,6 +248,13 @@ def test_runs_of_different_traffic_and_views_are_not_mixed():
     assert {name for _, name in tables.group(runs)} == {"evolution on rays", "evolution on grid"}
 
 
+def test_maps_of_one_name_are_not_mixed():
+    runs = [run("evolution", f"/{folder}/lab.png", 0, 1.0) for folder in "ab"]
+    assert [road for road, _ in tables.group(runs[:1])] == ["lab"]
+    assert [road for road, _ in tables.group(runs)] == ["/a/lab.png", "/b/lab.png"]
+    assert b"/b/lab.png,0," in tables.table_csv(tables.group(runs), Path())
+
+
 @pytest.mark.parametrize("plan", [None, PLAN])
 def test_the_terminal_shows_the_tables_also_of_what_was_stopped(tmp_path, monkeypatch, plan):
     monkeypatch.setattr(stopping, "requested", lambda: True)  # so that errors are not measured, in seconds each

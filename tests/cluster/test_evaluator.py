@@ -14,7 +14,10 @@ from gridsim.errors import GridSimError
 SHORT = SimConfig(episode=EpisodeConfig(target=100.0, time_limit=30.0))
 
 
-def test_episodes_follow_from_the_seed_and_results_from_genome_and_episode_alone() -> None:
+def test_episodes_follow_from_the_seed_and_results_from_genome_and_episode_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # only address="auto" asks for it
     with gridsim.Evaluator("curved", policy="mlp:8", traffic=2, sim=SHORT, episodes=6) as evaluator:
         genomes = np.random.default_rng(0).normal(size=(40, evaluator.genes)).astype(np.float32)
         results = evaluator.evaluate(genomes, seed=3)
@@ -67,7 +70,7 @@ def test_it_evaluates_networks_of_pedal_and_wheel(given: dict) -> None:
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
         ({"policy": "mlp"}, "mlp"),
         ({"workers": -1}, "--workers must be"),
-        ({"sim": SimConfig.load("f1tenth"), "traffic": 3}, "traffic is for cars of 2.9 m or more"),
+        ({"sim": SimConfig.load("f1tenth"), "traffic": 3}, "traffic is for cars of 2.83 m or more"),
         ({"episodes": 0}, "episodes must be 1 to 10,000, not 0"),
     ],
 )
@@ -87,6 +90,8 @@ def test_genomes_that_do_not_fit_are_refused() -> None:
         for wrong in (np.zeros((2, 5)), np.zeros(evaluator.genes)):
             with pytest.raises(GridSimError, match=r"^genomes of mlp:8 must be \[n, 336\], not \["):
                 evaluator.evaluate(wrong)
+        with pytest.raises(GridSimError, match=r"^at most 65,536 genomes can be evaluated at once, not 65,537$"):
+            evaluator.evaluate(np.zeros((65_537, evaluator.genes), dtype=np.float32))
         wrong = np.zeros((3, evaluator.genes))
         wrong[2, 7] = np.nan
         with pytest.raises(GridSimError, match=r"must be finite numbers; those of member 2 are not$"):

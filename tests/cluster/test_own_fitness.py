@@ -54,6 +54,12 @@ def test_it_is_found_by_name_and_decides_as_one_from_python_does(own: Path, name
     assert history[-1]["fitness/best"] < 0.0
 
 
+def test_a_file_that_was_changed_is_run_again(own: Path) -> None:
+    first, _ = gridsim.evolve(fitness="own.py:early", **SMALL)
+    own.write_text(OWN.replace('-results["steps"]', 'results["steps"]'))
+    assert gridsim.evolve(fitness="own.py:early", **SMALL)[0].sha256 != first.sha256
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

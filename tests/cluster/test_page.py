@@ -19,7 +19,7 @@ from cluster.report.page import Shown, write_page
 from cluster.store.champion import load_champion
 from evolution.networks.policy import PolicySpec
 from gridsim.car.vehicle import act
-from gridsim.config import constants
+from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.sensing.route import points_ahead
@@ -61,11 +61,27 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
         assert each["period"] == pytest.approx(0.1 * stride)
     first = 5 + 3 * boxes.shape[1]
     np.testing.assert_allclose(found[first : first + 31].T / 100, drive.ranges, atol=0.006)
-    chosen = found[first + 31 :].argmax(axis=0)
-    constant = constants(champion.sim)
-    for action, car, following in zip(chosen, drive.cars, drive.cars[1:], strict=False):
-        _, angle = act(constant, action, car[SPEED], car[STEERING])
-        assert angle == following[STEERING], "the greatest output is what it did"
+    assert steers_by(drive, found[first + 31 :].argmax(axis=0))
+    assert champion.sim == drive.sim
+
+
+@pytest.mark.parametrize(
+    "sim",
+    [SimConfig(sensors=SensorConfig(latency=0.3)), SimConfig(randomise=(("steering_rate", 40.0, 59.0),))],
+    ids=["late readings", "another car"],
+)
+def test_the_readings_and_the_car_of_a_drive_are_those_that_it_had(sim):
+    champion, road_map = replace(load_champion(CHAMPION), sim=sim), build("seamless", 2_000_000)
+    drive = record(champion, road_map, sample_starts(road_map, 1, np.random.default_rng(1))[0], 30.0)
+    assert len(drive.cars) > 50
+    assert steers_by(drive, drive.outputs.argmax(axis=1))
+
+
+def steers_by(drive, actions):
+    """Whether these actions turn the wheels of a drive as they turned."""
+    k, (speeds, angles) = constants(drive.sim), drive.cars[:, [SPEED, STEERING]].T
+    turned = [act(k, *each)[1] for each in zip(actions, speeds, angles, strict=True)]
+    return turned[:-1] == angles[1:].tolist()
 
 
 def test_pedal_and_wheel_are_shown_from_the_middle():
@@ -108,10 +124,13 @@ def test_a_map_file_is_shown_from_side_to_side_of_its_road():
 @needs_chromium
 def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
     _, drive, *shown = shown_drives()
-    path = tmp_path / "drive.html"
-    write_page(path, "one drive", shown[1:])
+    path, far = tmp_path / "drive.html", drive.cars.copy()
+    far[:, DISTANCE] *= 40.0
+    write_page(path, "one drive", [replace(shown[1], drive=replace(drive, cars=far))])
     with Browser(path.as_uri(), tmp_path / "profile") as browser:
         browser.wait_for("at > 1")
+        assert browser.run("value(drives[0], DISTANCE, 1e9) / 10") == pytest.approx(far[-1, DISTANCE], abs=0.06)
+        assert far[-1, DISTANCE] > 10_000.0
         assert browser.faults == []
     write_page(path, "two drives", shown, together=True)
     with Browser(path.as_uri(), tmp_path / "profile") as browser:

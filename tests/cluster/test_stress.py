@@ -52,6 +52,14 @@ def test_each_level_is_measured_printed_and_drawn(
         assert picture.size == (1500, 320)
 
 
+def test_what_is_drawn_for_each_episode_gets_worse_too() -> None:
+    drawn = (("lateral_grip", 3.0, 4.0), ("latency", 0.1, 0.3), ("steering_rate", 40.0, 60.0))
+    sim = dataclasses.replace(SHORT, randomise=drawn)
+    assert stress.KINEMATIC[0].at(0.5, sim).randomise == (("lateral_grip", 1.5, 2.0), *drawn[1:])
+    assert stress.STRESSES[3].at(0.4, sim).randomise == (drawn[0], ("latency", 0.4, 0.4), drawn[2])
+    assert stress.STRESSES[2].at(0.4, sim).randomise == drawn
+
+
 def test_a_dynamic_vehicle_is_stressed_by_friction_and_mass_in_place_of_grip(driver: Champion) -> None:
     sim = dataclasses.replace(SHORT, vehicle=VehicleConfig(model="single_track"))
     names = [each.name for each in stress.stresses(dataclasses.replace(driver, sim=sim))]

@@ -70,6 +70,22 @@ def test_picture_shows_other_cars_between_two_states(drive):
         assert (picture(renderer, seen, seconds) != picture(renderer, drive, seconds)).any()
 
 
+class Texts:
+    """In place of a renderer: a picture is the text on it."""
+
+    def draw(self, car, text, **_):
+        return text[0]
+
+
+def test_the_last_picture_shows_how_a_drive_ended_and_clocks_have_no_sixtieth_second(drive):
+    *_, last = frames(Texts(), replace(drive, end=End.COLLISION), 7.0)
+    assert last.endswith("0:12.0    collision")
+    *_, last = frames(Texts(), drive, 7.0)
+    assert "0:11." in last
+    slow = replace(drive.sim, episode=replace(drive.sim.episode, control_period=0.5))
+    assert picture(Texts(), replace(drive, sim=slow), 59.96).endswith("1:00.0")
+
+
 def test_film_is_whole_or_not_there(drive, tmp_path, monkeypatch):
     path, size = tmp_path / "f.mp4", (160, 120)
     path.write_bytes(b"the one before")
@@ -175,6 +191,9 @@ def test_watch_shows_a_recorded_drive(here, monkeypatch, capsys):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
         assert f"{pictures / 10:.1f} s, {pictures} pictures" in call(watch_main, monkeypatch, capsys, *film)[1]
         assert probe(here / "d.mp4")[5] == pictures
+    for sources in ((CHAMPION, "drive.csv"), ("drive.csv", CHAMPION)):
+        page = [*sources, "--seed", 3, "--seconds", 1, "--output", "d.html"]
+        assert call(watch_main, monkeypatch, capsys, *page)[0] == 0
     (here / "cut.csv").write_text((here / "drive.csv").read_text()[:-30])
     for line, said in (("cut.csv", "cut.csv, line 28"), ("drive.csv --generation 1", "its own driver, car and road")):
         assert said in refused(watch_main, monkeypatch, capsys, *line.split(), "--output", "e.mp4")[0]

@@ -209,6 +209,11 @@ def test_pedal_and_wheel_are_clipped_and_do_what_they_say(maps: Maps) -> None:
 # --- ends and options
 
 
+def test_traffic_is_given_for_each_road() -> None:
+    with pytest.raises(ValueError, match=r"for each of 2 roads, not \(4, 6, 8\)$"):
+        GridSimVectorEnv(2, scenario="city,highway", traffic=(4, 6, 8))
+
+
 def test_success_and_time_truncate_and_everything_else_terminates(maps: Maps) -> None:
     def drive_to_the_end(action: Action, **options: Any) -> list[Any]:
         """What each step returned, the same action in all."""

@@ -18,7 +18,12 @@ from gridsim.state import DISTANCE, SPEED
 ALL = SimConfig(
     vehicle=VehicleConfig(latency=0.2),
     sensors=SensorConfig(noise=0.1, noise_share=0.02, dropout=0.05, latency=0.3),
-    randomise=(("lateral_grip", 3.0, 4.9), ("steering_rate", 40.0, 60.0)),
+    randomise=(
+        ("lateral_grip", 3.0, 4.9),
+        ("steering_rate", 40.0, 60.0),
+        ("steering_limit", 20.0, 34.0),
+        ("latency", 0.1, 0.3),
+    ),
 )
 
 
@@ -120,6 +125,7 @@ def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> Non
         ((("model", 1.0, 2.0),), "unknown key randomise.'model'"),
         ((("width", 2.0, 1.0),), "randomise.width must be least and most, not 2 and 1"),
         ((("width", 0.0, 1.0),), "randomise.width must be "),
+        ((("lateral_grip", 4.9, np.inf),), "randomise.lateral_grip must be least and most, not 4.9 and inf"),
         ((("rear_axle", 1.2, 2.0), ("wheelbase", 1.8, 3.0)), "rear_axle must be below vehicle.wheelbase, 1.8 m"),
         ((("width", 1.6, 2.0), ("length", 1.0, 4.0)), "randomise.length: roads are not scaled for cars of 1 m"),
     ],

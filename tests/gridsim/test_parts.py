@@ -46,6 +46,7 @@ def test_files_of_a_folder_are_divided(folder):
     assert not has_lanes(str(folder))
     assert (label(str(folder)), label(f"{folder}/[0-2].yaml")) == (folder.name, f"{folder.name}-0-2")
     assert held_out_place(str(folder), built[-1]) == "held-out maps: 2.yaml"
+    assert divided(f"{folder}/*") == divided(str(folder)), "pictures are not maps beside YAML files"
     with pytest.raises(GridSimError, match="2 map files; it needs 3 or more"):
         build(f"{folder}/[01].yaml", 0)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from written_roads import (
     BRITAIN,
+    HALF,
     both_ways,
     commonroad,
     figure_of_eight,
@@ -24,8 +25,9 @@ from gridsim.config import LIMITS, SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.jit import njit
 from gridsim.maps.network import is_junction, make_network
-from gridsim.maps.real import content, load, shape, sumo
-from gridsim.maps.real.description import Lane, bounds_of
+from gridsim.maps.real import content, load, select, shape, sumo
+from gridsim.maps.real import lanelet2 as reader
+from gridsim.maps.real.description import Lane, RealRoad, bounds_of
 from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import build, label, traffic_on
 from gridsim.simulator import Simulator
@@ -74,6 +76,7 @@ def test_formats_give_the_same_lanes(tmp_path):
         "b.xodr": opendrive(200.0),
         "c.xml": commonroad(both_ways(200.0)),
         "d.osm": lanelet2(both_ways(200.0)),
+        "e.xodr": opendrive(200.0).replace("<OpenDRIVE>", '<OpenDRIVE xmlns="http://code.asam.net/opendrive_schema">'),
     }
     expected = np.array([[-100.0, -1.6, 100.0, -1.6], [100.0, 1.6, -100.0, 1.6]])
     for name, text in files.items():
@@ -222,7 +225,7 @@ def test_who_follows_does_not_block_the_way_back_over_its_lane(tmp_path):
     """Two cars on a lane: the first may enter the lane that comes back over it, although the other is on it."""
     name = written(tmp_path, "eight.xml", commonroad(figure_of_eight(30.0), EIGHT))
     lanes = load.read_road(load.Path(name)).lanes
-    network = as_they_are(lanes, load.sides_of(lanes), build(name, 0).road)
+    network = as_they_are(lanes, load.sides_of(RealRoad("", lanes)), build(name, 0).road)
     assert network.crossings.tolist() == [1, 0]
     world = np.zeros((2, TRAFFIC_FIELDS), dtype=np.float32)
     for car, along in zip(world, (57.0, 40.0), strict=True):
@@ -415,6 +418,46 @@ def test_crop(tmp_path):
         build(f"{name}@51.0,9.0,200", 0)
 
 
+def test_crop_is_in_the_coordinates_of_the_file(tmp_path):
+    name = written(tmp_path, "far.xodr", opendrive(400.0).replace('x="0" y="0"', 'x="5000" y="-3000"'))
+    part = build(f"{name}@5100,-3000,150", 0)
+    assert 200.0 < part.mileage[-1] < 500.0
+    low = next(note for note in load.described(name, SIM).notes if "lower left corner" in note)
+    assert "x 4944 m" in low
+
+
+def test_odd_lanelets():
+    assert reader._joined([[], ["a", "b"], ["c", "b"]]) == ["a", "b", "c"]
+    assert not reader._may_cross({"subtype": "dashed", "lane_change": "no"})
+    assert not reader._for_cars({"subtype": "bus_lane"})
+    west = np.array([[10.0, 0.0], [5.0, 0.0], [5.0, 0.0], [0.0, 0.0]])
+    assert not select._is_tight(west), "a vertex that is there twice is no turn"
+
+
+def test_a_way_round_the_world_does_not_come_back_over_the_map(tmp_path):
+    lanes = [([(a, HALF), (b, HALF)], [(a, -HALF), (b, -HALF)]) for a, b in ((0.0, 8.0), (8.0, 290.0))]
+    network = build(written(tmp_path, "oneway.xml", commonroad(lanes, {1: [2]})), 0).network
+    steps = np.diff(network.points, axis=0)[[k for k in range(len(network.points) - 1) if k + 1 not in network.offsets]]
+    assert (steps[:, 0] > 0.0).all(), "all lanes lead east"
+
+
+@pytest.mark.parametrize(
+    ("place", "left"),
+    [
+        ((51.5, -0.1), True), ((50.73, 1.61), False), ((22.3, 114.17), True), ((22.54, 114.06), False),
+        ((-8.84, 13.23), False), ((-11.66, 27.48), False), ((-12.82, 28.21), True), ((-1.95, 30.06), False),
+        ((-1.29, 36.82), True), ((34.5, 69.2), False), ((30.18, 66.99), True), ((29.65, 91.1), False),
+        ((27.7, 85.3), True), ((16.43, 102.83), True), ((17.97, 102.63), False), ((27.5, 94.9), True),
+        ((16.8, 96.2), False), ((11.66, 92.74), True), ((13.75, 100.5), True), ((11.56, 104.9), False),
+        ((21.03, 105.85), False), ((2.82, -60.67), False), ((6.8, -58.16), True), ((-22.27, 166.45), False),
+        ((-33.9, 151.2), True), ((49.19, -2.11), True), ((13.1, -59.6), True), ((37.57, 126.98), False),
+        ((35.68, 139.7), True), ((48.85, 2.35), False), ((52.52, 13.4), False), ((40.7, -74.0), False),
+    ],
+)  # fmt: skip
+def test_the_side_of_cities(place, left):
+    assert sumo.keeps_left(*place) == left
+
+
 def test_packed_openstreetmap_is_the_same(tmp_path):
     osmium = pytest.importorskip("osmium")
     name = written(tmp_path, "a.osm", osm(CROSSING))
@@ -448,6 +491,9 @@ BOMB = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "cc"><!ENTITY d "&b;&b;">]>
         ("i.osm", "<osm></osm>", "no nodes"),
         ("j.xml", commonroad([]), "no road"),
         ("k.net.xml", "<net></net>", "no road"),
+        ("l.osm", osm(CROSSING).replace('lat="', 'lat="x', 1), "damaged, or not as its format says"),
+        ("m.osm", osm([street((0.0, 0.0), (3e3, 0.0), (3e3, 3e3))]), r"its middle: FILE@50\.\d+,9\.\d+,2000$"),
+        ("n.xml", commonroad([([(0, 2), (0, -2)], [(0.1, 2), (0.1, -2)])]), "no road"),
     ],
 )
 def test_bad_files(tmp_path, monkeypatch, name, data, says):

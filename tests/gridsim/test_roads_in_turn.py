@@ -10,6 +10,7 @@ from written_roads import both_ways, commonroad
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.errors import GridSimError
+from gridsim.maps.atlas import make_atlas
 from gridsim.maps.parts import FIRST_SEEDS, is_map_file, road_of, roads_of, seed_of_map, seed_on, seeds_on
 from gridsim.maps.scenarios import REGISTRY, build, check_name, crowds, full_name, has_lanes, label, map_digest
 from gridsim.state import LANE
@@ -38,6 +39,19 @@ def test_files_whose_names_have_commas_are_one_road(here):
     assert not is_map_file("your,town.osm,city")
 
 
+def test_a_folder_does_not_hide_the_road_of_its_name(here):
+    (here / "city").mkdir()
+    assert not is_map_file("city")
+    assert is_map_file("./city")
+
+
+def test_maps_whose_lanes_fork_into_different_numbers_are_driven_together():
+    here = build("city", 0)
+    more = np.pad(here.network.successors, ((0, 0), (0, 2)), constant_values=-1)
+    atlas = make_atlas([here.road, here.road], [here.network, here.network._replace(successors=more)])
+    assert (atlas.lanes.successors == np.concatenate([more, more])).all()
+
+
 def test_all_and_paths_are_written_out(here):
     assert full_name("all") == ALL
     assert full_name("all,./a.osm@1,2,3") == f"{ALL},{here}/a.osm@1,2,3"
@@ -51,7 +65,7 @@ def test_all_and_paths_are_written_out(here):
         ("moon", "unknown scenario 'moon'; there are: city, curved"),
         ("highway,", "the name of a road is empty"),
         ("city,highway,city", "city is there twice"),
-        ("a/town.osm,b/town.osm", "town is there twice"),
+        ("a/town.osm,b/town.osm", "two of its roads have the name town; rename or copy a file"),
     ],
 )
 def test_names_that_are_wrong_are_told_in_one_line(name, said):

@@ -74,6 +74,19 @@ def test_a_car_of_this_model_drives_and_slides_outwards_in_a_bend() -> None:
         assert np.abs(car[:2] - driven["kinematic"][:2]).max() < (0.5 if outwards else 0.1)
 
 
+def test_it_backs_along_its_arc() -> None:
+    road, driven = build("highway", 0), []
+    start = sample_starts(road, 1, np.random.default_rng(0))
+    start[:, 3:] = -1.5, 0.4
+    for model in ("kinematic", "single_track"):
+        simulator = Simulator(1, SimConfig(VehicleConfig(**{**vars(SEDAN), "model": model})))
+        simulator.reset(road, start)
+        for _ in range(6):
+            simulator.step(np.array([7]))
+        driven.append(simulator.cars[0, :4].copy())
+    assert np.abs(driven[0] - driven[1]).max() < 0.2
+
+
 def test_wrong_numbers_are_refused() -> None:
     for wrong, said in (({"model": "wheels"}, "kinematic or single_track"), ({"mass": 0.0}, "vehicle.mass must be ")):
         with pytest.raises(ValueError, match=said):

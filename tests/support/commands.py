@@ -16,6 +16,7 @@ from subprocess import PIPE
 import psutil  # type: ignore[import-untyped]
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 BIN = Path(sys.executable).parent
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
@@ -28,6 +29,17 @@ def requirements(extra=""):
     """What the project and one of its extras ask for."""
     asked = map(Requirement, requires(PROJECT["project"]["name"]) or ())
     return [item for item in asked if item.marker is None or item.marker.evaluate({"extra": extra})]
+
+
+def needed(names):
+    """These distributions, and all that pip installs with them."""
+    found, waiting = set(), list(names)
+    while waiting:
+        if (name := canonicalize_name(waiting.pop())) not in found:
+            found.add(name)
+            items = map(Requirement, requires(name) or ())
+            waiting += [item.name for item in items if item.marker is None or item.marker.evaluate({"extra": ""})]
+    return found
 
 
 def start(program, *flags, cwd, **env):

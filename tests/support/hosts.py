@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Collection
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 from typing import Any
@@ -64,6 +65,13 @@ def package_folders() -> set[str]:
     places = [Path(__file__).parents[2], *map(Path, site.getsitepackages())]
     folders = [place / name for place in places for name in ("cluster", "evolution", "gridsim")]
     return {str(folder) for folder in folders if folder.exists()}
+
+
+def folders_of(distributions: Collection[str]) -> set[str]:
+    """The folders of modules that distributions of other projects have installed."""
+    files = [file for name in distributions for file in metadata.files(name) or () if len(file.parts) > 1]
+    folders = {str(Path(str(file.locate())).parents[len(file.parts) - 2]) for file in files if file.parts[0] != ".."}
+    return {folder for folder in folders if not folder.endswith(("-info", "__pycache__"))}
 
 
 @dataclass

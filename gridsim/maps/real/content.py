@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import re
 import tempfile
 import zlib
 from pathlib import Path
@@ -64,16 +63,19 @@ def parse(path: Path, data: bytes) -> Element:
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data[:64]:
         raise GridSimError(f"{path}: a map is XML in UTF-8 without a document type or entities")
     try:
-        return ElementTree.fromstring(data)
+        root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         if data.lstrip()[:1] != b"<":
             raise GridSimError(f"{path}: not a map: it is neither XML nor a picture; there are {FORMATS}") from None
         raise GridSimError(f"{path}: truncated or damaged XML: {shown(str(error))}") from None
+    for element in root.iter() if root.tag.startswith("{") else ():
+        element.tag = element.tag.rpartition("}")[2]  # without the file's namespace
+    return root
 
 
 def format_of(path: Path, data: bytes, root: Element) -> str:
     """A file's format: osm, lanelet2, opendrive, sumo or commonroad."""
-    name = re.sub(r"^\{.*\}", "", root.tag)
+    name = root.tag
     if name == "osm":
         return "lanelet2" if b"lanelet" in data and _has_lanelets(root) else "osm"
     known = {"OpenDRIVE": "opendrive", "net": "sumo", "commonRoad": "commonroad"}

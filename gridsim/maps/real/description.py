@@ -11,6 +11,7 @@ import numpy as np
 # m; where lanes are joined, the line may run backwards, if a file's nodes are closer together than junctions are wide.
 # A point where it turns back is removed if the segment before or after it is at most this long.
 RETURN = 4.0
+MOST_APART = 60.0  # m between the end of a lane and the next one's begin; half the shortest side of a torus is more
 RETURN_COSINE = -0.2  # a line runs backwards where the cosine of its turn at a point is at most this
 
 
@@ -49,6 +50,7 @@ class RealRoad:
     lanes: dict[str, Lane]
     junctions: dict[str, np.ndarray] = field(default_factory=dict)  # outlines float64 [n, 2]
     degrees: tuple[float, ...] = ()  # longitude, latitude of x = y = 0; m per degree of each; (): not Lanelet2, or in m
+    middle: str = ""  # LAT,LON amid the file, as a crop has it; "": the file's places are x and y in m
     hand: float = 0.0  # the side on which traffic drives: 1 right, -1 left; 0: unknown, `load.hand_of` finds it
     notes: list[str] = field(default_factory=list)  # what was changed, left out or assumed, a sentence each
 
@@ -121,7 +123,11 @@ def joined(one: Lane, other: Lane) -> Lane:
     """One lane made of `one` and of `other`, which follows it.
 
     It has the successors of `other`, the neighbours of `one`, and the limit (if known) and the junction of the longer.
+    If `one` goes round the world, `other` begins a side of the torus away.
     """
+    away = (one.centre[-1] - other.centre[0]) * np.array([1.0, 1.0, 0.0])
+    if np.hypot(*away[:2]) > MOST_APART:
+        other = replace(other, left=other.left + away, right=other.right + away)
     left, right = (np.concatenate([a, b[1:]]) for a, b in ((one.left, other.left), (one.right, other.right)))
     kept = _without_returns((left + right)[:, :2] / 2)
     limited = [lane for lane in (other, one) if not math.isnan(lane.speed)]

@@ -11,7 +11,7 @@ import numpy as np
 from gridsim.maps.real.content import Element
 from gridsim.maps.real.description import Lane, RealRoad, paired, without_repeats
 
-CAR_ROADS = {"road", "highway", "play_street", "bus_lane", ""}
+CAR_ROADS = {"road", "highway", "play_street", ""}
 LIMITS = {"urban": 50 / 3.6, "nonurban": 100 / 3.6, "private": 30 / 3.6}  # m/s, where a lanelet has none (Germany's)
 RADIUS = 6_378_137.0  # m, semi-major axis of WGS84
 FLATTENING_SQUARED = 0.00669438  # first eccentricity squared of WGS84
@@ -52,6 +52,7 @@ def read_lanelet2(root: Element) -> RealRoad:
     road = RealRoad("Lanelet2", lanes)
     road.degrees = degrees
     if degrees:
+        road.middle = f"{degrees[1]:.5f},{degrees[0]:.5f}"
         road.notes.append("latitude and longitude were projected to metres around the middle of the file")
     if others:
         road.notes.append(f"{others} lanelets that are not for cars were left out")
@@ -124,9 +125,9 @@ def _aligned(nodes: list[list[str]], places: dict[str, tuple[float, float, float
 
 def _joined(ways: list[list[str]]) -> list[str]:
     """The nodes of a bound that consists of several ways, one after the other; each may run in either direction."""
-    line = list(ways[0]) if ways else []
-    for way in ways[1:]:
-        if way and line and way[0] != line[-1]:
+    line, *others = [list(way) for way in ways if way] or [[]]
+    for way in others:
+        if way[0] != line[-1]:
             if way[-1] == line[-1]:
                 way = way[::-1]
             elif line[0] in (way[0], way[-1]):
@@ -144,7 +145,7 @@ def _for_cars(tags: dict[str, str]) -> bool:
 
 
 def _may_cross(tags: dict[str, str]) -> bool:
-    return tags.get("lane_change") == "yes" or "dashed" in tags.get("subtype", "")
+    return tags.get("lane_change", "yes" if "dashed" in tags.get("subtype", "") else "no") == "yes"
 
 
 def _limit(tags: dict[str, str]) -> float:

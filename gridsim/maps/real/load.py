@@ -33,7 +33,7 @@ from gridsim.maps.real.lights import with_lights
 from gridsim.maps.real.shape import network_of, resampled, shaped
 from gridsim.maps.real.sumo import convert, read_net
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
-from gridsim.reading import read_bytes
+from gridsim.reading import read_bytes, shown
 
 NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
 MAX_NODES = 1 << 24  # of a field, at most: those of 4 square km
@@ -71,7 +71,6 @@ class Prepared:
 
     format: str
     notes: list[str]  # of `RealRoad`
-    origin: np.ndarray  # float64 [2], m: the map's lower left corner, in the coordinates of `RealRoad`
     nodes: np.ndarray  # clearance (m), float32 [rows, columns]; `save` rounds it to the bytes of a field
     network: Network  # `speeds`, `clear` and `room` are zeros: `make_network` computes them
     limits: np.ndarray  # float64 [lanes], m/s; USUAL_LIMIT where the file gives none
@@ -82,7 +81,7 @@ class Prepared:
         lanes = {f"lanes_{name}": array for name, array in self.network._asdict().items()}
         text = np.array([self.format, *self.notes])
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".new", delete=False) as file:
-            np.savez_compressed(file, text=text, origin=self.origin, field=field, limits=self.limits, **lanes)
+            np.savez_compressed(file, text=text, field=field, limits=self.limits, **lanes)
         os.replace(file.name, path)
 
     @classmethod
@@ -94,7 +93,7 @@ class Prepared:
             *columns, width, height, hand = (arrays[f"lanes_{key}"] for key in Network._fields)
             scalars = (np.float32(value.item()) for value in (width, height, hand))
             network = Network._make([*map(freeze, columns), *scalars])
-            return cls(name, notes, arrays["origin"], nodes, network, arrays["limits"])
+            return cls(name, notes, nodes, network, arrays["limits"])
 
 
 def hand_of(lanes: dict[str, Lane]) -> float:
@@ -118,12 +117,14 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
         raise GridSimError(NO_ROAD)
     select.without_tight_turns(road)
     select.on_one_level(road)
+    if not road.lanes:
+        raise GridSimError(NO_ROAD)
     ends.add_turning_loops(road)
     road.lanes = select.keep(road.lanes, select.largest_connected(road.lanes))
     size = None
     joined = select.largest_joined(road.lanes)
     if sum(lane.length for lane in joined.values()) < road.length / 2:
-        size = sides_of(road.lanes)
+        size = sides_of(road)
         ends.join_round_the_world(road, size)
         joined = select.largest_joined(road.lanes)
     if not joined:
@@ -131,10 +132,12 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     road.lanes = joined
     if (cut := read - road.length) > 1.0:
         road.notes.append(f"{cut / 1000:.1f} of {read / 1000:.1f} km of lanes lead nowhere, or do not join the rest")
-    size = sides_of(road.lanes) if size is None else size
+    size = sides_of(road) if size is None else size
     points = np.concatenate([lane.centre[:, :2] for lane in road.lanes.values()])
     low, high = points.min(axis=0), points.max(axis=0)
     origin = np.round((low + high) / 2 - size / 2, 2)
+    if not road.middle:
+        road.notes.append(f"the map's lower left corner is the file's x {origin[0]:g} m, y {origin[1]:g} m")
     shift = np.append(origin, 0.0)
     for lane in road.lanes.values():
         lane.left, lane.right = lane.left - shift, lane.right - shift
@@ -149,20 +152,20 @@ def prepare(road: RealRoad, gap: float) -> Prepared:
     network = with_lights(network_of(lanes, conflicts, hand), lanes, road_there)
     limits = np.array([lane.speed for lane in lanes.values()])
     limits[~(limits >= SLOWEST_LIMIT)] = USUAL_LIMIT
-    return Prepared(road.format, road.notes, origin, nodes, network, limits)
+    return Prepared(road.format, road.notes, nodes, network, limits)
 
 
-def sides_of(lanes: dict[str, Lane]) -> np.ndarray:
-    """Sides (m) of the torus for these lanes: powers of two."""
-    points = np.concatenate([bound[:, :2] for lane in lanes.values() for bound in (lane.left, lane.right)])
+def sides_of(road: RealRoad) -> np.ndarray:
+    """Sides (m) of the torus for a road's lanes: powers of two."""
+    points = np.concatenate([bound[:, :2] for lane in road.lanes.values() for bound in (lane.left, lane.right)])
     extent = np.maximum(np.ptp(points, axis=0) + 2 * OUTSIDE + 1, SHORTEST_SIDE)
     sides = 2.0 ** np.ceil(np.log2(extent))
     if sides.prod() * CELLS_PER_UNIT**2 > MAX_NODES:
         x, y = points.min(axis=0) + np.ptp(points, axis=0) / 2
         raise GridSimError(
             f"a world of {sides[0]:,.0f} m x {sides[1]:,.0f} m (its sides are powers of two) is too large: at most "
-            f"{MAX_NODES / CELLS_PER_UNIT**2:,.0f} square metres; crop it: FILE@X,Y,METRES or FILE@LAT,LON,METRES, "
-            f"2,000 m at most; the middle of its roads is at x {x:.0f} m, y {y:.0f} m"
+            f"{MAX_NODES / CELLS_PER_UNIT**2:,.0f} square metres; crop it to 2,000 m at most, here about its middle: "
+            f"FILE@{road.middle or f'{x:.0f},{y:.0f}'},2000"
         )
     return sides
 
@@ -202,7 +205,7 @@ def split_name(name: str) -> tuple[Path, tuple[float, float, float] | None, floa
 def load_road(name: str, config: SimConfig) -> Map:
     """The map of a file of real roads; the last four are cached. Raises: GridSimError, also if config.unit < 1."""
     if config.unit < 1.0:
-        raise GridSimError(f"{name}: real roads are for cars of 2.9 m or more, not of {config.vehicle.length:g} m")
+        raise GridSimError(f"{name}: real roads are for cars of 2.83 m or more, not of {config.vehicle.length:g} m")
     return load(os.path.abspath(name), file_digest(name), config)
 
 
@@ -243,6 +246,8 @@ def prepared(name: str, digest: str, gap: float) -> Prepared:
         made = prepare(read_road(path, crop, hand), gap)
     except GridSimError as error:
         raise GridSimError(str(error) if str(error).startswith(str(path)) else f"{path}: {error}") from None
+    except ValueError as error:
+        raise GridSimError(f"{path}: damaged, or not as its format says: {shown(str(error))}") from error
     with contextlib.suppress(OSError):
         made.save(kept)
     return made

@@ -266,7 +266,7 @@ def _contract(lanes: dict[str, Lane], conflicts: Conflicts) -> None:
     crossed = {key for key in lanes if key in conflicts}
     few = {key for key in crossed if conflicts.cross[conflicts.index[key]].sum() <= ROUNDABOUT}
     crossed -= on_rings({key: [s for s in lanes[key].successors if s in few] for key in few})
-    for key in sorted(crossed, key=lambda name: lanes[name].length):
+    for key in sorted(crossed, key=lambda name: (lanes[name].length, name)):
         lane = lanes[key]
         onward = [s for s in lane.successors if s in crossed and s != key]
         if not before[key] or not onward or any(s in lane.successors for s in before[key]):

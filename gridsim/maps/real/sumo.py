@@ -29,12 +29,18 @@ OPTIONS = {
     ],
     "opendrive": [
         "--keep-edges.by-vclass=passenger", "--opendrive.curve-resolution=0.5", "--output.original-names",
+        "--offset.disable-normalization",  # x and y stay the file's
     ],
 }  # fmt: skip
 # Boxes (degrees): south, west, north, east. Traffic keeps left in those of LEFT_HAND, except in those of RIGHT_HAND.
 RIGHT_HAND = [
-    (5.6, 92.0, 28.5, 97.3), (14.0, 101.0, 23.4, 109.5), (8.0, 103.3, 14.0, 109.5),  # Myanmar, Laos, Vietnam, Cambodia
-    (33.0, 124.5, 43.0, 129.4),  # Korea
+    (17.5, 92.3, 21.2, 97.3), (15.5, 94.0, 24.0, 97.3), (21.0, 93.4, 23.9, 97.3), (24.0, 94.8, 27.0, 97.5),  # Myanmar
+    (17.93, 100.1, 22.5, 109.5), (16.0, 104.75, 18.0, 109.5), (14.0, 105.5, 16.0, 109.5),  # Laos, Vietnam
+    (8.0, 103.3, 14.0, 109.5), (33.0, 124.5, 43.0, 129.4),  # Cambodia, Korea
+    (31.4, 60.5, 38.5, 69.9), (29.3, 86.5, 37.1, 97.4), (22.51, 113.8, 22.6, 114.5),  # Afghanistan, Tibet, Shenzhen
+    (49.8, 1.4, 50.98, 1.9), (-17.3, 11.6, -4.4, 21.9), (-12.1, 25.3, -8.2, 28.4),  # Calais, Angola, Katanga
+    (-2.84, 28.86, -1.45, 30.8), (-4.47, 29.0, -2.31, 30.85),  # Rwanda, Burundi
+    (-23.0, 163.0, -13.0, 170.5), (1.1, -61.5, 5.3, -59.9),  # New Caledonia and Vanuatu, Roraima
 ]  # fmt: skip
 LEFT_HAND = [
     (49.8, -8.7, 60.9, 1.8), (51.3, -10.7, 55.5, -5.4),  # Great Britain and Ireland
@@ -45,6 +51,8 @@ LEFT_HAND = [
     (5.8, 60.8, 37.1, 97.4), (22.1, 113.8, 22.6, 114.5),  # India and its neighbours, Hong Kong
     (-35.0, 16.4, -16.9, 41.0), (-27.0, 11.7, -8.2, 40.9), (-12.0, 29.3, 4.7, 41.9),  # southern and eastern Africa
     (17.6, -78.5, 18.6, -76.1), (10.0, -61.95, 11.4, -60.4), (1.1, -61.5, 8.6, -53.9),  # the Caribbean, the Guyanas
+    (13.0, -59.7, 13.4, -59.4), (23.3, -79.4, 27.3, -74.0),  # Barbados, the Bahamas
+    (49.1, -2.8, 49.8, -1.95), (-20.6, 57.2, -19.9, 57.9),  # Jersey and Guernsey, Mauritius
 ]  # fmt: skip
 
 
@@ -71,12 +79,14 @@ def convert(
     side on which traffic drives: 1 right, -1 left; None: it follows from the coordinates
     (`keeps_left`, OpenStreetMap) or from the rule in the file (OpenDRIVE).
     """
-    options, notes = list(OPTIONS[kind]), []
+    options, notes, middle = list(OPTIONS[kind]), [], ""
     if kind == "osm":
         places = np.array([(float(n.get("lat", "nan")), float(n.get("lon", "nan"))) for n in root.iterfind("node")])
         if not len(places):
             raise GridSimError(f"{path}: it has no nodes; is it an extract of OpenStreetMap in XML?")
-        lefthand = keeps_left(*np.nanmedian(places, axis=0)) if hand is None else hand < 0.0
+        latitude, longitude = np.nanmedian(places, axis=0)
+        middle = f"{latitude:.5f},{longitude:.5f}"
+        lefthand = keeps_left(latitude, longitude) if hand is None else hand < 0.0
         if crop:
             half = np.array([crop[2], crop[2] / max(math.cos(math.radians(crop[0])), 0.01)]) / 2 / METRES_PER_DEGREE
             (south, west), (north, east) = crop[:2] - half, crop[:2] + half
@@ -94,7 +104,7 @@ def convert(
     road = read_net(parse(path, net), _limits(root) if kind == "opendrive" else None)
     if turned:
         _turn_round(road)
-    road.hand = -1.0 if lefthand else 1.0
+    road.hand, road.middle = -1.0 if lefthand else 1.0, middle
     road.format, road.notes = {"osm": "OpenStreetMap", "opendrive": "OpenDRIVE"}[kind], notes + road.notes
     return road
 
@@ -165,7 +175,8 @@ def read_net(root: Element, limits: dict[str, float] | None = None) -> RealRoad:
                 closed, before = closed + 1, ""
                 continue
             origin = element.find("param[@key='origId']")
-            limit = (limits or {}).get("" if origin is None else origin.get("value", "").split("_")[0], math.nan)
+            roads = "" if origin is None else origin.get("value", "").partition(" ")[0].rpartition("_")[0]
+            limit = (limits or {}).get(roads, math.nan)
             speed = float(element.get("speed", "nan")) if math.isnan(limit) else limit
             lanes[name] = Lane(*bounds_of(line, _width(element)), speed, junction="")
             numbered[key, int(element.get("index", "0"))] = name
