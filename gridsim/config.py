@@ -219,7 +219,7 @@ class SimConfig:
 
     @cached_property
     def unit(self) -> float:
-        """The unit in m: 1, or for cars shorter than 2.8 m one of 1/2, 1/4, 1/8 and 1/16.
+        """The unit in m: 1, or for cars shorter than 2.83 m one of 1/2, 1/4, 1/8 and 1/16.
 
         Generated roads, walls and the resolution of maps are sized in units. The speed intervals of generated roads,
         and of map files that give none, are multiplied by the square root of the unit (Froude's law); speeds in

@@ -209,7 +209,8 @@ class Simulator:
     def _arrays(self, physics: Physics) -> tuple[Any, ...]:
         """State of all cars as kernels read it; worlds are None without traffic, histories without delays."""
         worlds, seen = self.worlds if self.worlds.shape[1] else None, (self.ranges, self.closing, self.observations)
-        histories, delays = None, Simulation(None, None, *physics[1]).delays
+        histories = None
+        *_, delays, _ = physics[1]
         if delays:
             if delays not in self._histories:
                 shapes = (len(self), delays.readings, 2, self.ranges.shape[1]), (len(self), delays.commands, 2)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,7 +78,12 @@ def parameters(config: SimConfig, features: tuple[str, ...] = (), start: np.ndar
     own = config if start is None else config.drawn(start)
     k, model = constants(own), MODELS[own.vehicle.model].parameters(own.vehicle)
     rays = fan(own.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(own), rays, model, *imperfections_of(own), encoding(features, constants(config))
+    return k, drivers(own), rays, model, *imperfections_of(own), _scales(features, config)
+
+
+@lru_cache
+def _scales(features: tuple[str, ...], config: SimConfig) -> Encoding:
+    return encoding(features, constants(config))
 
 
 def simulations_on(

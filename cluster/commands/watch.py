@@ -227,7 +227,8 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     _, cars, ranges, worlds = replay(recorded, scenario)
     for episode in range(int(recorded.episodes[-1]) + 1):
         own = recorded.episodes == episode
-        drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, config)
+        sim = config.drawn(recorded.poses[own][0])
+        drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, sim)
         yield drive, f"episode {episode + 1}"
 
 
@@ -255,8 +256,8 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     sims = [each.drive.sim for each in shown]
-    if len({(sim.vehicle, sim.traffic.lights, sim.traffic.city_lights) for sim in sims}) > 1:
-        raise GridSimError("a page shows one kind of car, either with traffic lights or without; give --sim")
+    if len({(sim.vehicle.length, sim.vehicle.width, sim.traffic.lights, sim.traffic.city_lights) for sim in sims}) > 1:
+        raise GridSimError("a page shows cars of one size, either with traffic lights or without; give --sim")
     title = f"GridSim: {', '.join(sources)} on {shown[0].drive.scenario.name}"
     write_page(output, title, shown, together=bool(flags.beside))
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")

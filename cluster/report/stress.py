@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from cluster.report.pictures import drawable, figure_of, plain_style
 from cluster.store.champion import Champion, evaluate
-from gridsim.config import SimConfig
+from gridsim.config import LIMITS, SimConfig
 from gridsim.maps.scenarios import Traffic
 
 PICTURE = "stress.png"
@@ -28,9 +28,10 @@ class Stress(NamedTuple):
         """The configuration `sim` with this number, and its range in `randomise`, set to a level, or if `share` to that
         multiple.
         """
+        least, most, *_ = LIMITS[self.part][self.name]
 
         def worse(value: float) -> float:
-            return level * value if self.share else level
+            return min(max(level * value, least), most) if self.share else level
 
         part, randomise = getattr(sim, self.part), sim.randomise
         if self.part == "vehicle":

@@ -8,7 +8,7 @@ import shutil
 import sys
 import tomllib
 from collections.abc import Iterator
-from importlib.metadata import distribution
+from importlib.metadata import distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import hosts
 import jsonschema  # type: ignore[import-untyped]
 import pytest
 import yaml
-from commands import BIN, all_in_mlflow, needed, ray_workers, requirements, summary, wait_until
+from commands import BIN, all_in_mlflow, finish, needed, ray_workers, requirements, summary, wait_until
 from hosts import HOME, Host
 
 from cluster.commands.cli import EvolveFlags
@@ -82,6 +82,18 @@ def test_versions_are_those_that_the_project_asks_for(root: Path, name: str) -> 
         assert spec.get("rayClusterSpec", spec)["rayVersion"] == ray
 
 
+def lacking(root: Path) -> set[str]:
+    """What GridSim's commands need, and workers do not have."""
+    return {item.name for item in requirements("evolve")} - needed(pinned(read(root, "local"), head=False))
+
+
+def test_workers_import_only_what_they_have(root: Path) -> None:
+    text = "import sys, cluster.workers.ray_pool; print(*{name.partition('.')[0] for name in sys.modules})"
+    loaded = {*finish("python", "-c", text, cwd=root).stdout.split()}
+    assert "gymnasium" in loaded
+    assert not [name for name in loaded if {*packages_distributions().get(name, "?")} <= lacking(root)]
+
+
 def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
     documents = kuberay(root)
     spec = documents["RayCluster"]["spec"]
@@ -126,9 +138,8 @@ class Machines:
         keep = [root, Path(sys.prefix), Path(sys.base_prefix), CACHE_FOLDER]
         self.laptop = stack.enter_context(contextlib.closing(hosts.switch(folder / "laptop", keep)))
         self.head = stack.enter_context(contextlib.closing(Host(folder / "head", keep)))
-        lacking = {item.name for item in requirements("evolve")} - needed(pinned(read(root, "local"), head=False))
-        assert {"mlflow", "pillow", "torch"} <= lacking
-        without = hosts.package_folders() | hosts.folders_of(lacking)
+        assert {"mlflow", "pillow", "torch"} <= lacking(root)
+        without = hosts.package_folders() | hosts.folders_of(lacking(root))
         self.worker = stack.enter_context(contextlib.closing(Host(folder / "worker", keep, without)))
         self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
         authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()

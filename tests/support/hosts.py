@@ -71,7 +71,7 @@ def folders_of(distributions: Collection[str]) -> set[str]:
     """The folders of modules that distributions of other projects have installed."""
     files = [file for name in distributions for file in metadata.files(name) or () if len(file.parts) > 1]
     folders = {str(Path(str(file.locate())).parents[len(file.parts) - 2]) for file in files if file.parts[0] != ".."}
-    return {folder for folder in folders if not folder.endswith(("-info", "__pycache__"))}
+    return {name for name in folders if not name.endswith(("-info", "__pycache__")) and os.path.isdir(name)}
 
 
 @dataclass

@@ -59,7 +59,7 @@ def without_tight_turns(road: RealRoad) -> None:
 
 def _is_tight(line: np.ndarray) -> bool:
     """Whether a polyline [n, 2] turns by more than TURN within TURN * TIGHTEST m."""
-    step = np.diff(without_repeats(line), axis=0)
+    step = np.diff(without_repeats(line, JOINT / 2), axis=0)
     angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*step.T))])
     # last[i] is the first point that is TURN * TIGHTEST m or more beyond the end of segment i.
