@@ -78,8 +78,8 @@ class RunSettings(ABC):
     several roads the worst one counts."""
 
     pace: Annotated[float, IN_WORDS] = 0.0
-    """Mean speed in m/s that a champion should reach: slower success counts for less, and training's time limits
-    follow from it. By default a little above the lower end of the road's speed interval."""
+    """Mean speed in m/s below which success counts for less; training's time limits follow from it. By default a little
+    above the lower end of the road's speed interval (docs/roads.md)."""
 
     def __post_init__(self) -> None:
         for name in ("scenario", "sim"):
@@ -221,11 +221,10 @@ class EvolveSettings(RunSettings):
     """How many times the usual compute: car-steps grow with it, population and validation with its square root. For a
     cluster, about its workers divided by two; the champion depends on this number, not on the workers."""
     policy: Annotated[str, IN_WORDS] = ""
-    """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
-    +steering to see its own steering angle, +route to see where a route leads that it has to follow, +limit to see the
-    road's speed limit, +mirrors to see how far behind other cars are on either side; by default mlp:64+steering, in
-    traffic mlp:128+motion+steering, on several roads with +limit, and +mirrors in traffic (the paper's is mlp:6,7). On
-    the grid cnn: with the channels of two convolutions, the units of a dense layer and the number of frames, by default
+    """Network: mlp: and the sizes of its hidden layers, then in this order +motion to see how fast the cars that rays
+    hit approach, +steering its own steering angle, +route where a route leads that it has to follow, +limit the road's
+    speed limit, +mirrors how far behind other cars are on either side; by default mlp:64+steering, in traffic
+    mlp:128+motion+steering, on several roads with +limit, and +mirrors in traffic (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of a dense layer and the number of frames, by default
     cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
@@ -247,8 +246,8 @@ class EvolveSettings(RunSettings):
     search: Literal["evolution", "random"] = "evolution"
     """evolution, or random: new random genomes in each generation, as a baseline."""
     fitness: Annotated[str, IN_WORDS] = ""
-    """An objective of your own: MODULE:FUNCTION or FILE.py:FUNCTION (docs/own.md). Of the champions that succeed in
-    --until of the validation episodes, it decides which one is best, and the run goes on to its limit."""
+    """An objective of your own: MODULE:FUNCTION or FILE.py:FUNCTION (docs/own.md). The champion is chosen by success, up
+    to --until, and then by this; the run goes on to its limit, --generations or --car-steps."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -326,9 +325,9 @@ class DqnSettings(RunSettings):
     by default mlp:64,64+steering, on several roads with +limit, and +mirrors in traffic; on the grid cnn: with the
     channels of two convolutions, the units of a dense layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
-    """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""
+    """Car-steps at most; those that are driven at once (some 33,000) and the evaluation after them may exceed it."""
     episodes: Annotated[int, IN_WORDS] = 0
-    """Training episodes at most, by default any number; the last batch may exceed it."""
+    """Training episodes at most, by default any number; those that are driven at once may exceed it."""
     converged: float = 0.01
     """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
     to the next, three times in a row; 0: never."""
@@ -346,13 +345,13 @@ class DqnSettings(RunSettings):
     """Adam's learning rate at the start; it falls to a twentieth over --anneal. By default 0.001, on the grid
     0.0005."""
     anneal: Annotated[int, IN_WORDS] = 0
-    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth. By
-    default 30 million, on the grid 4 million."""
+    """Car-steps over which the learning rate falls; in the first fiftieth, exploration falls from random driving to
+    --epsilon. By default 30 million, on the grid 4 million."""
     target_period: Annotated[int, IN_WORDS] = 0
     """Updates from one copy of the target network to the next; by default 200, on the grid 500."""
     epsilon: float = 0.4
-    """Share of random actions in the episode of a batch that explores most; the others explore less (Horgan et al.
-    2018)."""
+    """Final share of random actions in the episode that explores most of those driven at once; the others explore less
+    (Horgan et al. 2018)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the learner computes: auto, cpu or cuda."""
 

@@ -199,14 +199,14 @@ class SimConfig:
         """A checked configuration from a mapping like that of a file; None is an empty one. Raises: GridSimError."""
         values = {} if values is None else values
         if not isinstance(values, Mapping):
-            raise GridSimError(f"it is a mapping with {', '.join(LIMITS)}, not {shown(values)}")
+            raise GridSimError(f"it needs {', '.join(LIMITS)}, as keys with values, not {shown(values)}")
         _check_names("", values, [*LIMITS, "base", "randomise"])
         base = _preset(str(values["base"])) if "base" in values else SimConfig()
         parts = {}
         for part, limits in LIMITS.items():
             given = {} if values.get(part) is None else values[part]
             if not isinstance(given, Mapping):
-                raise GridSimError(f"{part} is a mapping with {', '.join(limits)}, not {shown(given)}")
+                raise GridSimError(f"{part} needs {', '.join(limits)}, as keys with values, not {shown(given)}")
             before = getattr(base, part)
             _check_names(f"{part}.", given, [f.name for f in dataclasses.fields(before)])
             others = {name: n if isinstance(n, bool) else str(n) for name, n in given.items() if name not in limits}
@@ -292,7 +292,7 @@ def _ranges(given: Any) -> tuple[tuple[str, float, float], ...]:
         rows = [(name, *ends) for name, ends in given.items()] if isinstance(given, Mapping) else given
         return tuple((str(name), float(least), float(most)) for name, least, most in rows)
     except (TypeError, ValueError):
-        raise GridSimError(f"randomise is a mapping of names to [least, most], not {shown(given)}") from None
+        raise GridSimError(f"randomise needs names with [least, most], not {shown(given)}") from None
 
 
 def names_file(name: str) -> bool:

@@ -85,8 +85,8 @@ class EvolveFlags:
     """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
 
     The run's folder holds the champion, history, pictures and a checkpoint, which is renewed every second, or after a
-    generation that takes longer; MLflow holds its curves. The champion depends on the scenario, the seed and the
-    algorithm's parameters alone, never on the workers.
+    generation that takes longer; MLflow holds its curves. Except with --wall-time, the same flags give the same
+    champion on one type of machine, whatever the workers do.
     """
 
     example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1"
@@ -100,8 +100,8 @@ class DqnFlags:
     """Train a driver by deep Q-learning: workers collect experience while the learner trains on what they collected.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
-    curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. It
-    depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. Except
+    with --wall-time, the same flags give the same champion on one type of machine, whatever the workers do.
     """
 
     example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1"
@@ -125,15 +125,15 @@ class EvaluateFlags(RoadFlags):
     champion: tyro.conf.Positional[str]
     """A champion.npz, or a run's folder."""
     episodes: int = 64
-    """Number of episodes; the default 64 are the held-out episodes of every run."""
+    """Number of episodes on each road; the default 64 are the held-out episodes of every run."""
     errors: bool = False
     """Also its velocity and steering errors against the reference driver."""
     stress: bool = False
     """Also drive it with more and more noise, dropped readings, latency and ever less grip: a table, and stress.png
     beside the champion."""
     suite: bool = False
-    """Drive the suite: all five roads with usual traffic, 512 drives each, the same for everybody. Writes suite.json
-    beside the champion, or checks the one that is there (docs/results.md)."""
+    """Drive the suite: all five roads with usual traffic, 512 drives each, the same for everybody. Compares the result
+    with suite.json beside the champion, and writes that anew (docs/results.md)."""
     json: bool = False
     """Print one JSON object and nothing else."""
 

@@ -87,10 +87,10 @@ class WorkFlags:
     address: Annotated[str, IN_WORDS] = ""
     """An existing Ray cluster: auto, or host:port; local stays on this machine. By default RAY_ADDRESS, else local."""
     patience: Annotated[float, IN_WORDS] = 0.0
-    """Seconds without any worker after which a run stops; it can be resumed. A worker that does not answer for so long
-    is replaced. By default 300, and 60 for an answer on this machine."""
+    """Of Ray workers: seconds until one that does not answer is replaced, by default 60 on this machine, 300 on a
+    cluster; and until a run without any worker stops, by default 300. It can be resumed."""
     tracking_uri: Annotated[str, IN_WORDS] = ""
-    """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
+    """Where MLflow keeps runs. By default where a resumed run is, else MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: Annotated[str, IN_WORDS] = ""
     """MLflow's experiment; by default that of a run that is continued, else MLFLOW_EXPERIMENT_NAME, else gridsim."""
 
@@ -177,7 +177,7 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         new, old = (" ".join(value) if isinstance(value, tuple) else value for value in (new, old))
         problem, remedy = f"contradicts the {what}'s {'default' if old == '' else old}", "leave it out"
         if f.name in may_grow:
-            problem = problem if old else f"does not limit the {what}"
+            problem = problem if old else f"is a new limit for the {what}"
             remedy = f"give a greater {' or '.join(as_flag(name) for name in may_grow if getattr(before, name))}"
         raise GridSimError(f"{as_flag(f.name)} {new} {problem}; {remedy}, or start a new {what}")
 

@@ -53,7 +53,7 @@ class CompareFlags(WorkFlags, Plan):
     runs: tyro.conf.Positional[tuple[str, ...]] = ()
     """Folders of finished runs to compare, in place of training."""
     quick: bool = False
-    """A first look, in minutes: one seed, 10 s per run."""
+    """For a new comparison: a first look, in minutes, with one seed and 10 s per run."""
     name: Annotated[str, IN_WORDS] = ""
     """Name of the comparison; by default made from the time."""
     resume: Annotated[str, IN_WORDS] = ""
@@ -145,7 +145,8 @@ def _compare() -> int:
 def _compare_finished(console: Console, flags: CompareFlags) -> int:
     for f in dataclasses.fields(flags):
         if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(CompareFlags(), f.name):
-            raise GridSimError(f"{common.as_flag(f.name)}: finished runs are compared as they are; leave it out")
+            name = "--quick" if flags.quick else common.as_flag(f.name)
+            raise GridSimError(f"{name}: finished runs are compared as they are; leave it out")
     runs = read_runs(map(Path, flags.runs))
     path = new_folder(Path(flags.output), flags.name, "comparison")
     path.mkdir(parents=True)

@@ -48,7 +48,7 @@ def _map() -> int:
         raise GridSimError(f"{name} is several roads; name one of them, or a folder")
     check_name(name)
     if flags.crop and split_name(name)[1] is None:
-        raise GridSimError(f"--crop {flags.crop}: it is LAT,LON,METRES or X,Y,METRES")
+        raise GridSimError(f"--crop {flags.crop}: give LAT,LON,METRES or X,Y,METRES")
     files = files_of(name)
     if flags.output and len(files) > 1:
         raise GridSimError(f"--output: name one of the {len(files)} files, not all")

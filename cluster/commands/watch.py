@@ -66,8 +66,8 @@ class WatchFlags(RoadFlags):
     output: Annotated[str, IN_WORDS] = ""
     """Write a film, .mp4 or .gif, or a page, .html, in place of the window."""
     generation: Annotated[int | None, IN_WORDS] = None
-    """Watch this generation's elite (of a DQN: this evaluation's network), not the champion; 0 is the first, as in
-    history.csv and MLflow."""
+    """Watch this generation's elite, which is its leader (of a DQN: this evaluation's network), not the champion; 0 is
+    the first, as in history.csv and MLflow."""
     follow: bool = False
     """Watch the newest elite, while the run is still going."""
     seconds: Annotated[float, IN_WORDS] = 0.0

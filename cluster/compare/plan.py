@@ -51,7 +51,7 @@ class Plan:
     learners: tuple[Learner, ...] = LEARNERS
     """Learners to compare."""
     seeds: int = 3
-    """Seeds of each, 0 and up; 1 with --quick."""
+    """How many seeds, from 0 on, each is trained with; 1 with --quick."""
     observation: Observation = "rays"
     """What the networks see besides the speed: rays (31 ranges) or grid (an occupancy grid)."""
     budget: str = "60s"
@@ -67,8 +67,8 @@ class Plan:
     generations: Annotated[int, IN_WORDS] = 0
     """Generations at most, of evolution and random search; by default any number within the budget."""
     grid: Annotated[tuple[str, ...], IN_WORDS] = ()
-    """Settings to vary, as in sigma=0.3,0.5 population=128,256: each combination is compared as a learner of its
-    own."""
+    """Settings to vary, which all --learners must have: sigma=0.3,0.5 population=128,256 of evolution. Each combination
+    is compared as a learner of its own."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scenarios", tuple(map(full_name, self.scenarios)))
@@ -83,7 +83,9 @@ class Plan:
             raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         runs = dataclasses.replace(self, seeds=1).planned(Path())
         if len({run.name for run in runs}) != len(runs):
-            raise GridSimError("two runs would have the same name: name all once, also in --grid, or rename a map")
+            raise GridSimError(
+                "two runs would have the same name: give each scenario, learner and --grid value once, or rename a map"
+            )
         # Evolution's settings are checked even if only the DQN runs: the DQN's lack --population and --generations.
         for settings in (self.settings(self.scenarios[0], "evolution", 0), *(run.settings for run in runs)):
             settings.check()

@@ -62,25 +62,26 @@ def read_run(folder: Path) -> Run:
     path, again = folder / SUMMARY, f"--resume {as_argument(folder)}"
     if not (folder / CONFIG).is_file():
         raise GridSimError(f"{folder} is not a run's folder: there is no {CONFIG}")
-    if not path.is_file():
-        raise GridSimError(f"{folder} is not finished: there is no {SUMMARY}; finish it with {again}")
     settings, _ = read_config(folder / CONFIG)
+    again = f"{settings.command} {again}"
+    if not path.is_file():
+        raise GridSimError(f"{folder} is not finished: there is no {SUMMARY}; finish it with: {again}")
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
         held_out = {"km_per_collision": math.nan} | summary["held_out"]  # earlier versions did not write this figure
         figures = {name: float((summary | held_out)[name]) for name in RUN_FIGURES}
         return Run(folder, settings, str(summary["champion_sha256"]), figures)
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
-        raise GridSimError(f"{path} is damaged; delete it, and make it again with {again}") from error
+        raise GridSimError(f"{path} is damaged; delete it, and make it again with: {again}") from error
 
 
 def measured(run: Run) -> Run:
     """A run with its ERROR_FIGURES, nan if all drives of its champion are too short. Raises GridSimError, Stopped."""
     road, traffic = run.settings.scenario, run.settings.traffic
-    champion, again = load_champion(run.folder / CHAMPION), f"--resume {as_argument(run.folder)}"
+    champion, again = load_champion(run.folder / CHAMPION), f"{run.settings.command} --resume {as_argument(run.folder)}"
     if champion.sha256 != run.champion_sha256:
         files = f"{CHAMPION} and {SUMMARY} do not belong together"
-        raise GridSimError(f"{run.folder}: {files}; delete {SUMMARY}, and make both again with {again}")
+        raise GridSimError(f"{run.folder}: {files}; delete {SUMMARY}, and make both again with: {again}")
     found = series(champion, road, HELD_OUT_EPISODES, HELD_OUT_SEED, traffic)
     figures = errors(found, VehicleConfig()) if found else {}
     missed = {name: figures.get(original, math.nan) for name, original in ERROR_FIGURES.items()}

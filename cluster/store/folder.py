@@ -90,7 +90,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
     try:
         config = json.loads(path.read_bytes())
         if config["format"] != CONFIG_FORMAT:
-            raise RunError(f"{path} is of an earlier GridSim, whose runs this one cannot continue; start a new run")
+            raise RunError(f"{path} is of another GridSim, whose runs this one cannot continue; start a new run")
         settings = from_dict(SETTINGS[config["command"]], config["settings"])
         if config.get("map_sha256") != _sources(settings).get("map_sha256"):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
@@ -187,7 +187,7 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     if not name:
         name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
-        raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
+        raise RunError(f"--name {name!r}: begin with a letter or digit, then also . _ + - = @; 200 at most")
     path = output / name
     allowed = BEGUN if may_exist else set[str]()
     if path.exists() and not (path.is_dir() and {p.name for p in path.glob("[!.]*")} <= allowed):

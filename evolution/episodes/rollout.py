@@ -68,7 +68,7 @@ def policy_buffers(spec: PolicySpec, config: SimConfig) -> Buffers:
         grid = np.empty(CELLS * CELLS, dtype=np.uint8)
         return GridBuffers(grid_table(config), convnet.scratch(spec), grid), command
     if config.sensors.rays != RAYS:
-        raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
+        raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}: set sensors.rays to {RAYS}")
     return None, command
 
 

@@ -68,8 +68,8 @@ class PolicySpec(ABC):
                 )
         else:
             raise GridSimError(
-                f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, and what else it "
-                f"sees (+{', +'.join(OPTIONAL)}), or cnn for the grid, as in cnn:8,16,32@1"
+                f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, and then, in this "
+                f"order, what else it sees (+{', +'.join(OPTIONAL)}), or cnn for the grid, as in cnn:8,16,32@1"
             )
         if spec.size > MAX_GENES:
             raise GridSimError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")

@@ -118,7 +118,7 @@ def _numbers(value: Any, what: str, *limits: tuple[float, float]) -> list[float]
 def _checked(path: Path, values: Any) -> MapFile:
     """The MapFile of a YAML's values. Raises: ValueError, whose message does not name the file."""
     if not isinstance(values, dict):
-        raise ValueError(f"a map's YAML is a mapping with image and resolution, not {shown(values)}")
+        raise ValueError(f"a map's YAML needs image and resolution, as keys with values, not {shown(values)}")
     ignored = [str(key) for key in values if key not in KEYS]
     for key in ignored:
         if like := difflib.get_close_matches(key, KEYS, 1, ALIKE):
@@ -231,7 +231,7 @@ def _sides(free: np.ndarray, pixel: float, unit: float) -> tuple[int, int]:
     width, height = columns * node, rows * node
     if columns * rows > MAX_NODES:
         raise ValueError(
-            f"a world of {width:,.0f} m x {height:,.0f} m (its sides are powers of two) is too large: "
+            f"a map of {width:,.0f} m x {height:,.0f} m (its sides are rounded up to powers of two) is too large: "
             f"at most {MAX_NODES * node**2:,.0f} square metres; check the resolution, or crop it"
         )
     return columns, rows

@@ -218,7 +218,7 @@ def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypa
         config = {"format": form, "command": "gridsim-evolve", "settings": {"scenario": "curved"}}
         (folder / "config.json").write_text(json.dumps(config))
         (line,) = refused(evolve_main, monkeypatch, capsys, flag, path)
-        assert "old/config.json is of an earlier GridSim, whose runs this one cannot continue; start a new run" in line
+        assert "old/config.json is of another GridSim, whose runs this one cannot continue; start a new run" in line
         assert (os.listdir(here), os.listdir(folder)) == (["old"], ["config.json"])
 
 
@@ -238,7 +238,7 @@ def stopped(tmp_path):
         ("--actions continuous", "contradicts the run's mlp:64+steering; leave it out, or start a new run"),
         ("--seed 6", "--seed 6 contradicts the run's 5; leave it out, or start a new run"),
         ("--generations 2", "--generations 2 contradicts the run's 6; give a greater --generations, or start a new"),
-        ("--car-steps 1e6", "--car-steps 1000000 does not limit the run; give a greater --generations"),
+        ("--car-steps 1e6", "--car-steps 1000000 is a new limit for the run; give a greater --generations"),
         ("--output elsewhere", "contradicts the run's"),
         ("--config r/config.json", "--resume and --config exclude each other"),
         ("--generations 9 --tracking-uri ftp://x", "not a tracking address"),  # no contradiction

@@ -58,14 +58,14 @@ def test_a_file_gives_any_numbers_and_the_others_are_its_bases(tmp_path):
         (None, "No such file"),
         ("vehicle: [", "not valid YAML, line 1"),
         ("- 1", "a mapping with vehicle, sensors, episode, traffic, not"),
-        ("vehicle: 4", "vehicle is a mapping with length, width"),
+        ("vehicle: 4", "vehicle needs length, width"),
         ("vehicles: {}", "unknown key 'vehicles'; did you mean vehicle?"),
         ("vehicle: {wheel_base: 2}", "unknown key vehicle.'wheel_base'; did you mean wheelbase?"),
         ("vehicle: {colour: 2}", "unknown key vehicle.'colour'; there are: length"),
         ("base: f1tent", "unknown simulator 'f1tent'; did you mean f1tenth?"),
         ("vehicle: {length: long}", "vehicle.length must be a number from 0.2 to 30 m, not 'long'"),
         ("sensors: {rays: 31.5}", "sensors.rays must be a whole number, not 31.5"),
-        ("randomise: {width: 3}", "randomise is a mapping of names to [least, most], not {'width': 3}"),
+        ("randomise: {width: 3}", "randomise needs names with [least, most], not {'width': 3}"),
     ],
 )
 def test_a_file_that_is_wrong_is_refused_in_a_line_that_names_it(tmp_path, text, said):

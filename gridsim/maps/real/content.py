@@ -61,7 +61,8 @@ def parse(path: Path, data: bytes) -> Element:
     """The root of an XML file."""
     # No format of roads needs a document type; entities in it could grow without limit, or read files.
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data[:64]:
-        raise GridSimError(f"{path}: a map is XML in UTF-8 without a document type or entities")
+        text = "not a picture (.png, .jpg, .pgm, .bmp), nor plain XML in UTF-8 without a document type or entities"
+        raise GridSimError(f"{path}: {text}")
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:

@@ -35,7 +35,7 @@ from gridsim.maps.real.sumo import convert, read_net
 from gridsim.maps.roads import CELLS_PER_UNIT, FIELD_FLOOR, FIELD_STEPS, Strips, make_road
 from gridsim.reading import read_bytes, shown
 
-NO_ROAD = "no road for cars on which one can drive on; is it a map of roads, and the crop on them?"
+NO_ROAD = "no road for cars is left on which one can go on; are there roads in the file, and in the crop?"
 MAX_NODES = 1 << 24  # of a field, at most: those of 4 square km
 SHORTEST_SIDE = 128.0  # m, of the torus; half of it is more than a sensor's range can be
 USUAL_LIMIT = 50 / 3.6  # m/s, where a file gives none
@@ -163,7 +163,7 @@ def sides_of(road: RealRoad) -> np.ndarray:
     if sides.prod() * CELLS_PER_UNIT**2 > MAX_NODES:
         x, y = points.min(axis=0) + np.ptp(points, axis=0) / 2
         raise GridSimError(
-            f"a world of {sides[0]:,.0f} m x {sides[1]:,.0f} m (its sides are powers of two) is too large: at most "
+            f"a map of {sides[0]:,.0f} m x {sides[1]:,.0f} m (sides rounded up to powers of two) is too large: at most "
             f"{MAX_NODES / CELLS_PER_UNIT**2:,.0f} square metres; crop it to 2,000 m at most, here about its middle: "
             f"FILE@{road.middle or f'{x:.0f},{y:.0f}'},2000"
         )
