@@ -224,7 +224,8 @@ class EvolveSettings(RunSettings):
     """Network: mlp: and the sizes of its hidden layers, then in this order +motion to see how fast the cars that rays
     hit approach, +steering its own steering angle, +route where a route leads that it has to follow, +limit the road's
     speed limit, +mirrors how far behind other cars are on either side; by default mlp:64+steering, in traffic
-    mlp:128+motion+steering, on several roads with +limit, and +mirrors in traffic (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of a dense layer and the number of frames, by default
+    mlp:128+motion+steering, on several roads with +limit, and +mirrors in traffic (the paper's is mlp:6,7). On the grid
+    cnn: with the channels of two convolutions, the units of a dense layer and the number of frames, by default
     cnn:8,16,32@1."""
     actions: Actions = "discrete"
     """What the network decides: discrete, one of the paper's eight actions, or continuous, pedal and wheel."""
@@ -246,8 +247,8 @@ class EvolveSettings(RunSettings):
     search: Literal["evolution", "random"] = "evolution"
     """evolution, or random: new random genomes in each generation, as a baseline."""
     fitness: Annotated[str, IN_WORDS] = ""
-    """An objective of your own: MODULE:FUNCTION or FILE.py:FUNCTION (docs/own.md). The champion is chosen by success, up
-    to --until, and then by this; the run goes on to its limit, --generations or --car-steps."""
+    """An objective of your own: MODULE:FUNCTION or FILE.py:FUNCTION (docs/own.md). The champion is chosen by success,
+    up to --until, and then by this; the run goes on to its limit, --generations or --car-steps."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -172,7 +172,7 @@ def test_a_run_of_a_version_that_did_not_measure_kilometres_per_collision_is_com
         *(("config.json", text, "config.json") for text in ("", '{"format": 9}')),
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
         ("summary.json", {"car_steps": 10**400}, "damaged"),
-        ("summary.json", {"held_out": {}}, "make it again with --resume"),
+        ("summary.json", {"held_out": {}}, "make it again with: gridsim-evolve --resume"),
     ],
 )
 def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):

@@ -57,7 +57,7 @@ def test_a_file_gives_any_numbers_and_the_others_are_its_bases(tmp_path):
     [
         (None, "No such file"),
         ("vehicle: [", "not valid YAML, line 1"),
-        ("- 1", "a mapping with vehicle, sensors, episode, traffic, not"),
+        ("- 1", "needs vehicle, sensors, episode, traffic, as keys with values, not"),
         ("vehicle: 4", "vehicle needs length, width"),
         ("vehicles: {}", "unknown key 'vehicles'; did you mean vehicle?"),
         ("vehicle: {wheel_base: 2}", "unknown key vehicle.'wheel_base'; did you mean wheelbase?"),
