@@ -23,6 +23,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -185,6 +186,9 @@ def main() -> int:
         parser.error("--runs must be 1 or more")
     try:
         alone, among = load_champion(options.champion), load_champion(options.champion_traffic)
+        for champion in (alone, among):
+            if not re.fullmatch(r"mlp:[\d,]+", champion.policy):
+                parser.error(f"give a champion of mlp:N,N without more, not of {champion.policy}")
     except CheckpointError as error:
         parser.error(f"{error}")
     if hasattr(os, "sched_setaffinity"):

@@ -32,7 +32,7 @@ from cluster.store.steps import read_elites
 from gridsim.config import SimConfig, names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
-from gridsim.maps.parts import is_map_file, road_number
+from gridsim.maps.parts import is_map_file, road_number, seed_of_map
 from gridsim.maps.scenarios import Traffic, build, check_name, full_name, label, traffic_on
 from gridsim.state import End
 from gridsim.traffic.world import spawn
@@ -253,7 +253,8 @@ def _page(flags: WatchFlags, output: Path, limit: float) -> None:
                 champion, _ = _driver(Path(source), flags)
                 road = full_name(flags.scenario or champion.scenario)
                 flags = dataclasses.replace(flags, scenario=road, traffic=_cars(champion, road, flags.seed, flags))
-    if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
+    roads = [each.drive.scenario for each in shown]
+    if len({(road.name, seed_of_map(road.name, road.seed)) for road in roads}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     sims = [each.drive.sim for each in shown]
     if len({(sim.vehicle.length, sim.vehicle.width, sim.traffic.lights, sim.traffic.city_lights) for sim in sims}) > 1:
@@ -315,7 +316,8 @@ def _drive() -> int:
     with contextlib.closing(_Window(size, f"GridSim: {flags.scenario}")) as window:
         recorder = Recorder(flags.record, scenario, traffic, sim) if flags.record else None
         try:
-            done = drive(scenario, start, window, Renderer(scenario, size, config), recorder, seconds, traffic)
+            renderer = Renderer(scenario, size, config.drawn(start))
+            done = drive(scenario, start, window, renderer, recorder, seconds, traffic, config)
             print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
         finally:  # also if the drive is interrupted
             if recorder is not None:

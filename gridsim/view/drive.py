@@ -18,6 +18,7 @@ from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
+from gridsim.maps.parts import seed_of_map
 from gridsim.maps.scenarios import check_name
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, LANE, SPEED, STEPS, End, X, Y, poses_of
@@ -64,7 +65,8 @@ def manual(config: SimConfig, traffic: int = 0) -> Simulator:
 
 def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> None:
     """Begin an episode at start float32 [5], in traffic drawn with the map's seed and the episode's number."""
-    key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
+    seed = seed_of_map(road_map.name, road_map.seed)  # a file is read again by its own name, not as one of a folder
+    key = np.random.SeedSequence([seed, episode, *b"drive"]).generate_state(1, np.uint64)
     worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
     simulator.reset(road_map, start[None], worlds=worlds)
 
@@ -205,13 +207,14 @@ def drive(
     recorder: Recorder | None = None,
     seconds: float = math.inf,
     traffic: int = 0,
+    config: SimConfig | None = None,
 ) -> dict[str, float]:
     """Let a person drive in real time until Esc, Q or the window's closing, or for `seconds` of simulated time.
 
-    Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
+    Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad); `config`, by default the renderer's.
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them. Raises: GridSimError.
     """
-    simulator = manual(renderer.config, traffic)
+    simulator = manual(config or renderer.config, traffic)
     period = renderer.config.episode.control_period
     pictures = max(round(period * FPS), 1)  # per control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"

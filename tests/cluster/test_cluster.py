@@ -110,6 +110,7 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
         pod = group["template"]["spec"]
         (container,) = pod["containers"]
         assert pod["securityContext"]["runAsNonRoot"]
+        assert f"--uid {pod['securityContext']['runAsUser']} " in (root / "docker/Dockerfile").read_text()
         assert container["image"].endswith(f"/gridsim:{version}")
         assert not container["securityContext"]["allowPrivilegeEscalation"]
         assert all(isinstance(value, str) for value in group["rayStartParams"].values())
