@@ -149,7 +149,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
             raise GridSimError(f"{name}: finished runs are compared as they are; leave it out")
     runs = read_runs(map(Path, flags.runs))
     path = new_folder(Path(flags.output), flags.name, "comparison")
-    path.mkdir(parents=True)
+    path.mkdir(parents=True, exist_ok=True)
     return common.FAILED if _report(console, path, runs, None) else 0
 
 

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from commands import BIN, all_in_mlflow, finish, needed, ray_workers, requirements, summary, wait_until
 from hosts import HOME, Host
+from packaging.utils import canonicalize_name
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
@@ -84,14 +85,17 @@ def test_versions_are_those_that_the_project_asks_for(root: Path, name: str) -> 
 
 def lacking(root: Path) -> set[str]:
     """What GridSim's commands need, and workers do not have."""
-    return {item.name for item in requirements("evolve")} - needed(pinned(read(root, "local"), head=False))
+    return {canonicalize_name(item.name) for item in requirements("evolve")} - needed(
+        pinned(read(root, "local"), head=False)
+    )
 
 
 def test_workers_import_only_what_they_have(root: Path) -> None:
     text = "import sys, cluster.workers.ray_pool; print(*{name.partition('.')[0] for name in sys.modules})"
     loaded = {*finish("python", "-c", text, cwd=root).stdout.split()}
+    projects, without = packages_distributions(), lacking(root)
     assert "gymnasium" in loaded
-    assert not [name for name in loaded if {*packages_distributions().get(name, "?")} <= lacking(root)]
+    assert not [name for name in loaded if {*map(canonicalize_name, projects.get(name, "?"))} <= without]
 
 
 def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:

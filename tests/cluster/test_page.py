@@ -74,6 +74,7 @@ def test_the_readings_and_the_car_of_a_drive_are_those_that_it_had(sim):
     champion, road_map = replace(load_champion(CHAMPION), sim=sim), build("seamless", 2_000_000)
     drive = record(champion, road_map, sample_starts(road_map, 1, np.random.default_rng(1))[0], 30.0)
     assert len(drive.cars) > 50
+    assert drive.outputs is not None
     assert steers_by(drive, drive.outputs.argmax(axis=1))
 
 

@@ -323,7 +323,7 @@ def test_pictures_that_are_no_maps(tmp_path):
 
 # A YAML, and what the line says.
 WRONG = {
-    "[1, 2]": "mapping",
+    "[1, 2]": "needs image and resolution",
     "[" * 2000: "not valid YAML",
     "!!python/object/apply:os.system ['true']": "not valid YAML",
     "resolution: 0.1": "image",
