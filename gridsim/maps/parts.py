@@ -21,7 +21,10 @@ from gridsim.config import names_file
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 
-TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = FIRST_SEEDS = 0, 1_000_000, 2_000_000  # the first seed of each part
+TRAINING_SEED: int = 0
+VALIDATION_SEED: int = 1_000_000
+HELD_OUT_SEED: int = 2_000_000
+FIRST_SEEDS = TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED  # the first seed of each part
 PICTURES = (".png", ".pgm", ".jpg", ".jpeg", ".bmp")
 YAMLS = (".yaml", ".yml")
 ROADS = (".osm", ".pbf", ".xodr", ".xml", ".gz")
