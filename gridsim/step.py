@@ -83,6 +83,7 @@ def parameters(config: SimConfig, features: tuple[str, ...] = (), start: np.ndar
 
 @lru_cache
 def _scales(features: tuple[str, ...], config: SimConfig) -> Encoding:
+    """The encoding; kept, as `constants` checks all that `randomise` may draw, which takes longer than a reset."""
     return encoding(features, constants(config))
 
 

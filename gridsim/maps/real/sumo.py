@@ -35,8 +35,8 @@ OPTIONS = {
 # Boxes (degrees): south, west, north, east. Traffic keeps left in those of LEFT_HAND, except in those of RIGHT_HAND.
 RIGHT_HAND = [
     (17.5, 92.3, 21.2, 97.3), (15.5, 94.0, 24.0, 97.3), (21.0, 93.4, 23.9, 97.3), (24.0, 94.8, 27.0, 97.5),  # Myanmar
-    (17.93, 101.3, 22.5, 109.5), (20.3, 100.1, 22.5, 101.3),  # Laos and Vietnam, as the next two
-    (16.0, 104.8, 18.0, 109.5), (14.0, 105.5, 16.0, 109.5),
+    (17.93, 101.3, 22.5, 109.5), (20.3, 100.1, 22.5, 101.3), (16.0, 104.8, 18.0, 109.5),  # northern Laos and Vietnam
+    (14.0, 105.5, 16.0, 109.5),  # southern Laos, central Vietnam
     (8.0, 103.3, 14.0, 109.5), (33.0, 124.5, 43.0, 129.4),  # Cambodia, Korea
     (31.4, 60.5, 38.5, 69.9), (29.3, 86.5, 37.1, 97.4), (22.51, 113.8, 22.6, 114.5),  # Afghanistan, Tibet, Shenzhen
     (49.8, 1.4, 50.98, 1.9), (-17.3, 11.6, -4.4, 21.9), (-12.1, 25.3, -8.2, 28.4),  # Calais, Angola, Katanga
