@@ -199,14 +199,14 @@ class SimConfig:
         """A checked configuration from a mapping like that of a file; None is an empty one. Raises: GridSimError."""
         values = {} if values is None else values
         if not isinstance(values, Mapping):
-            raise GridSimError(f"it needs {', '.join(LIMITS)}, as keys with values, not {shown(values)}")
+            raise GridSimError(f"give some of {', '.join(LIMITS)} as keys with values, not {shown(values)}")
         _check_names("", values, [*LIMITS, "base", "randomise"])
         base = _preset(str(values["base"])) if "base" in values else SimConfig()
         parts = {}
         for part, limits in LIMITS.items():
             given = {} if values.get(part) is None else values[part]
             if not isinstance(given, Mapping):
-                raise GridSimError(f"{part} needs {', '.join(limits)}, as keys with values, not {shown(given)}")
+                raise GridSimError(f"{part}: give some of {', '.join(limits)} as keys with values, not {shown(given)}")
             before = getattr(base, part)
             _check_names(f"{part}.", given, [f.name for f in dataclasses.fields(before)])
             others = {name: n if isinstance(n, bool) else str(n) for name, n in given.items() if name not in limits}

@@ -154,7 +154,8 @@ class Simulator:
         self._physics: Physics | None = None  # None: made when a kernel needs it next
         self._starts = np.zeros((cars, POSE), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
-        self._histories: dict[Delays, tuple[np.ndarray, np.ndarray]] = {}  # of all cars, for each length that one has
+        # Readings and commands of all cars (`History`), for each Delays that a car has.
+        self._histories: dict[Delays, tuple[np.ndarray, np.ndarray]] = {}
         self.maps: dict[int, Map] = {}  # the map of each car that was reset
         self._row_of: dict[Map, int] = {}  # row of each map in the atlas
         self._rows = np.full(cars, -1)  # row of each car's map in the atlas

@@ -187,7 +187,7 @@ def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> P
     if not name:
         name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
-        raise RunError(f"--name {name!r}: begin with a letter or digit, then also . _ + - = @; 200 at most")
+        raise RunError(f"--name {name!r}: begin with a letter, digit or _, then also . + - = @; at most 200 of them")
     path = output / name
     allowed = BEGUN if may_exist else set[str]()
     if path.exists() and not (path.is_dir() and {p.name for p in path.glob("[!.]*")} <= allowed):

@@ -28,9 +28,8 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     """Concatenate maps. The field of a single map, which may be large, is not copied."""
     most = max(network.successors.shape[1] for network in networks)
     networks = [
-        network._replace(successors=np.pad(onward, ((0, 0), (0, most - onward.shape[1])), constant_values=-1))
-        for network in networks
-        for onward in [network.successors]
+        n._replace(successors=np.pad(n.successors, ((0, 0), (0, most - n.successors.shape[1])), constant_values=-1))
+        for n in networks
     ]
     *columns, width, height, hand = zip(*networks, strict=True)
     lanes = Network._make([*(freeze(np.concatenate(column)) for column in columns), width[0], height[0], hand[0]])

@@ -57,8 +57,8 @@ def test_a_file_gives_any_numbers_and_the_others_are_its_bases(tmp_path):
     [
         (None, "No such file"),
         ("vehicle: [", "not valid YAML, line 1"),
-        ("- 1", "needs vehicle, sensors, episode, traffic, as keys with values, not"),
-        ("vehicle: 4", "vehicle needs length, width"),
+        ("- 1", "give some of vehicle, sensors, episode, traffic as keys with values, not"),
+        ("vehicle: 4", "vehicle: give some of length, width"),
         ("vehicles: {}", "unknown key 'vehicles'; did you mean vehicle?"),
         ("vehicle: {wheel_base: 2}", "unknown key vehicle.'wheel_base'; did you mean wheelbase?"),
         ("vehicle: {colour: 2}", "unknown key vehicle.'colour'; there are: length"),
