@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import operator
 import platform
 import warnings
 from collections.abc import Callable
@@ -19,7 +20,9 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.core import types
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+from numba.core.extending import intrinsic
 from numba.core.registry import CPUDispatcher
 
 from gridsim.cache import cache_folder
@@ -158,6 +161,35 @@ def leaf(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
 def exact(function: Callable[..., Any]) -> Callable[..., Any]:
     """A `leaf` without `fastmath`: it rounds the same in every kernel that inlines it, and as NumPy does."""
     return leaf(function, fastmath=False)
+
+
+def _item(typingctx, arrays, i):
+    """For kernels: `arrays[i]`; the same of each array in a named tuple; None of None.
+
+    Numba knows which of these when it compiles. Of `None if arrays is None else arrays[i]` it would make an optional
+    array, for which all kernels that take it would be compiled once more, and which they would test in each step.
+    """
+    if isinstance(arrays, types.NoneType):
+        return arrays(arrays, i), lambda context, builder, signature, values: context.get_dummy_value()
+    several = isinstance(arrays, types.BaseTuple)
+    getitem = typingctx.resolve_value_type(operator.getitem)
+    kinds = [getitem.get_call_type(typingctx, (part, i), {}) for part in (arrays if several else [arrays])]
+    rows = [kind.return_type for kind in kinds]
+    result = types.BaseTuple.from_types(rows, arrays.instance_class) if several else rows[0]
+
+    def codegen(context, builder, signature, values):
+        whole, index = values
+        parts = [builder.extract_value(whole, k) for k in range(len(kinds))] if several else [whole]
+        each = [
+            context.get_function(operator.getitem, kind)(builder, (part, index))
+            for kind, part in zip(kinds, parts, strict=True)
+        ]
+        return context.make_tuple(builder, result, each) if several else each[0]
+
+    return result(arrays, i), codegen
+
+
+item: Any = intrinsic(_item)
 
 
 def freeze(array: np.ndarray) -> np.ndarray:

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from gridsim.car.reward import reward
-from gridsim.car.vehicle import NEUTRAL, Action, act, act_continuous
+from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig, constants
-from gridsim.jit import ZERO, F, I, leaf, njit
+from gridsim.jit import item, leaf, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.imperfections import Delays, History, late_command, new_history
+from gridsim.sensing.imperfections import Delays, History, new_history
 from gridsim.sensing.observation import encoding
 from gridsim.sensing.route import check_lanes
-from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
-from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
+from gridsim.state import CAR_FIELDS, DISTANCE, POSE, SPEED, START_FIELDS, TRAFFIC_FIELDS, End
+from gridsim.step import Simulation, look, obey, parameters, place, simulations_on, step, visit_cells
 
 # Once an atlas has this many maps, adding another removes those on which there are no cars. A generated map takes some
 # 2 MB, a map from a file up to 70 MB.
@@ -34,36 +34,21 @@ def _on_map(physics, row):
 
 
 @leaf
-def _history_of(histories, i):
-    """The History of car i; None without delays."""
-    if histories is None:
-        return None
-    return History(histories[0][i], histories[1][i])
-
-
-@leaf
 def _look(simulation, i, cars, worlds, seen, histories):
     """Have car i look around; args as in `_control_all`."""
     ranges, closing, observations = seen
-    world = None if worlds is None else worlds[i]
-    look(simulation, cars[i], world, ranges[i], closing[i], observations[i], _history_of(histories, i))
+    look(simulation, cars[i], item(worlds, i), ranges[i], closing[i], observations[i], item(histories, i))
 
 
 @leaf
-def _control(simulation, i, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
+def _control(simulation, i, discrete, commands, limits, ends, rewards, cars, visits, worlds, seen, histories):
     """One control period of car i; args as in `_control_all`."""
     constants, car = simulation.constants, cars[i]
     before, runs_on = car[DISTANCE], ends[i] == 0
     if runs_on:
-        history = _history_of(histories, i)
-        if actions.ndim == 1:
-            action, _ = late_command(history, car, F(actions[i]), ZERO, NEUTRAL)
-            acceleration, steering = act(constants, I(action), car[SPEED], car[STEERING])
-        else:
-            pedal, wheel = late_command(history, car, actions[i, 0], actions[i, 1], ZERO)
-            acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-        world = None if worlds is None else worlds[i]
-        ends[i] = step(simulation, car, visits[i], world, acceleration, steering, *limits)
+        history = item(histories, i)
+        acceleration, steering = obey(constants, car, history, discrete, commands[i, 0], commands[i, 1])
+        ends[i] = step(simulation, car, visits[i], item(worlds, i), acceleration, steering, *limits)
     _look(simulation, i, cars, worlds, seen, histories)
     if runs_on:
         gained, fastest = car[DISTANCE] - before, simulation.road.speed_high
@@ -84,18 +69,21 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, seen, 
 
 
 @njit(nogil=True)
-def _control_all(physics, order, runs, actions, limits, ends, rewards, cars, visits, worlds, seen, histories):
+def _control_all(
+    physics, order, runs, discrete, commands, limits, ends, rewards, cars, visits, worlds, seen, histories
+):  # fmt: skip
     """One control period of every car in `order`; a car whose episode has ended stands still.
 
     Args: `order` int64 [k], indices of cars, sorted by map; `runs` int64 [maps, 3], for each map with cars its row in
-    the atlas and the range of its cars in `order`; `limits`, target (m) and maximum of control steps.
+    the atlas and the range of its cars in `order`; `commands` float32 [n, 2], `discrete` or not, as of `step.obey`;
+    `limits`, target (m) and maximum of control steps.
     Writes, for these cars: `rewards` [n]; `seen`: ranges and closing speeds [n, rays] and observations [n, values].
     Updates `ends`, `cars`, `visits`, `worlds` and `histories`.
     """
     for row, first, last in runs:
         simulation = _on_map(physics, row)
         for i in order[first:last]:
-            _control(simulation, i, actions, limits, ends, rewards, cars, visits, worlds, seen, histories)
+            _control(simulation, i, discrete, commands, limits, ends, rewards, cars, visits, worlds, seen, histories)
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -155,7 +143,7 @@ class Simulator:
         self._starts = np.zeros((cars, POSE), dtype=np.float32)
         self._drawn: dict[int, tuple[Any, ...]] = {}  # cars' own `parameters`, if vehicles are randomised
         # Readings and commands of all cars (`History`), for each Delays that a car has.
-        self._histories: dict[Delays, tuple[np.ndarray, np.ndarray]] = {}
+        self._histories: dict[Delays, History | None] = {}
         self.maps: dict[int, Map] = {}  # the map of each car that was reset
         self._row_of: dict[Map, int] = {}  # row of each map in the atlas
         self._rows = np.full(cars, -1)  # row of each car's map in the atlas
@@ -214,8 +202,7 @@ class Simulator:
         *_, delays, _ = physics[1]
         if delays:
             if delays not in self._histories:
-                shapes = (len(self), delays.readings, 2, self.ranges.shape[1]), (len(self), delays.commands, 2)
-                self._histories[delays] = np.zeros(shapes[0], np.float32), np.zeros(shapes[1], np.float32)
+                self._histories[delays] = new_history(delays, self.ranges.shape[1], (len(self),))
             histories = self._histories[delays]
         return self.cars, self.visits, worlds, seen, histories
 
@@ -263,17 +250,16 @@ class Simulator:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
         if np.shape(actions) not in ((len(self),), (len(self), 2)):
             raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
-        actions = checked_actions(actions)
+        discrete, commands = _commands(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
         limits = np.float32(self.target), self.max_steps
         for batch in self._batches():
-            _control_all(*batch, actions, limits, self.ends, rewards, *self._arrays(batch[0]))
+            _control_all(*batch, discrete, commands, limits, self.ends, rewards, *self._arrays(batch[0]))
         return rewards
 
 
 @njit
-def _views(simulation, cars, worlds, closing, ranges, observations):
-    history = new_history(simulation.delays, ranges.shape[1])
+def _views(simulation, cars, worlds, closing, ranges, observations, history):
     for i in range(cars.shape[0]):
         look(simulation, cars[i], worlds[i], ranges[i], closing, observations[i], history)
 
@@ -298,18 +284,22 @@ def views(
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     observations = np.empty((len(cars), simulation.encoding.first[-1]), dtype=np.float32)
     closing = np.zeros(config.sensors.rays * ("motion" in features), dtype=np.float32)
-    _views(simulation, cars, worlds, closing, ranges, observations)
+    history = new_history(simulation.delays, config.sensors.rays)
+    _views(simulation, cars, worlds, closing, ranges, observations, history)
     return ranges, observations
 
 
-def checked_actions(actions: np.ndarray) -> np.ndarray:
-    """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous."""
+def _commands(actions: np.ndarray) -> tuple[bool, np.ndarray]:
+    """Whether actions are discrete [n] or continuous [n, 2], and the commands of `step.obey`, float32 [n, 2].
+
+    Both kinds have one type, or kernels would be compiled twice. Raises: ValueError.
+    """
     array = np.asarray(actions)
     if array.ndim == 2:
         if array.dtype.kind not in "fiu" or np.isnan(array).any():
             raise ValueError("continuous actions must be numbers, and not nan")
-        return np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
+        return False, np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
     wrong = (array < 0) | (array >= len(Action)) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
     if wrong.any():
         raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {array[wrong][0]}")
-    return np.ascontiguousarray(array, dtype=np.int64)
+    return True, np.stack([array, np.zeros_like(array)], axis=1, dtype=np.float32, casting="unsafe")

@@ -16,6 +16,7 @@ import numpy as np
 
 from gridsim.car.kinematic import path_curvature
 from gridsim.car.models import MODELS, front_velocity, move
+from gridsim.car.vehicle import NEUTRAL, act, act_continuous
 from gridsim.collision import collides, hits_box, stands_ahead, top_speed_near
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import ONE, ZERO, F, I, leaf, njit
@@ -23,7 +24,7 @@ from gridsim.maps.lights import CLEARING, crosses_line, set_clock, way_to_line
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
-from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_readings
+from gridsim.sensing.imperfections import Delays, Imperfections, degrade, imperfections_of, late_command, late_readings
 from gridsim.sensing.observation import ROUTE, Encoding, encoding, observe, sees
 from gridsim.sensing.rays import cast_boxes, cast_lines, fan, sense
 from gridsim.sensing.route import ASTRAY, begin_route, check_lanes, follow_route
@@ -78,7 +79,7 @@ def parameters(config: SimConfig, features: tuple[str, ...] = (), start: np.ndar
     own = config if start is None else config.drawn(start)
     k, model = constants(own), MODELS[own.vehicle.model].parameters(own.vehicle)
     rays = fan(own.sensors.rays, k.ray_first, k.ray_step)
-    return k, drivers(own), rays, model, *imperfections_of(own), _scales(features, config)
+    return k, drivers(own), rays, model, *imperfections_of(config, own), _scales(features, config)
 
 
 @lru_cache
@@ -166,16 +167,28 @@ def look(simulation, car, world, ranges, closing, observation, history):
     if simulation.network.lines.shape[0] > 0:
         seconds, reach = car[CLOCK] * constants.dt, constants.ray_range
         cast_lines(simulation.network, fan, reach, seconds, x, y, car[COS], car[SIN], ranges, closing)
-    degrade(simulation.imperfections, constants.ray_range, car, ranges)
+    degrade(simulation.imperfections, constants.ray_range, car, ranges, closing)
     late_readings(history, car, ranges, closing)
     observe(simulation, car, world, ranges, closing, observation)
+
+
+@leaf
+def obey(constants, car, history, discrete, first, second):
+    """Acceleration (m/s2) and steering (rad) of a command, which is late by `history`.
+
+    A `discrete` command is the number of an action, and 0; any other is pedal and wheel.
+    """
+    first, second = late_command(history, car, first, second, NEUTRAL if discrete else ZERO)
+    if discrete:
+        return act(constants, I(first), car[SPEED], car[STEERING])
+    return act_continuous(constants, first, second, car[SPEED], car[STEERING])
 
 
 @leaf
 def step(simulation, car, visits, world, acceleration, steering, target, max_steps):
     """One control step: advance in sub-steps with collision checks, count new ground, check for the end.
 
-    Args: acceleration m/s2 and steering rad, as of `vehicle.act`; the episode's limits: `target`, m of new ground, and
+    Args: acceleration m/s2 and steering rad, as of `obey`; the episode's limits: `target`, m of new ground, and
     `max_steps`, control steps.
     Returns: an End as a number.
     """

@@ -49,7 +49,7 @@ def _marker(settings: RunSettings) -> Path:
     road = "file" if is_map_file(settings.scenario) else file_name(label(settings.scenario))
     traffic = "traffic" if settings.traffic else "alone"
     sim = settings.simulator()
-    noisy, late = (part is not None for part in imperfections_of(sim))
+    noisy, late = (part is not None for part in imperfections_of(sim, sim))
     chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", "noisy": noisy, "late": late, OWN: has_own(settings)}
     chosen["continuous"] = settings.policy.endswith(CONTINUOUS)
     special = "".join(f"{name}-" for name, there in chosen.items() if there)

@@ -17,17 +17,16 @@ from evolution.episodes.comfort import NOTES
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, PolicySpec, decide, pack, scratch_size
 from gridsim.car.reward import reward
-from gridsim.car.vehicle import NEUTRAL, act, act_continuous
 from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import ZERO, F, I, U, exact, freeze, leaf, njit
+from gridsim.jit import ZERO, F, U, exact, freeze, item, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.imperfections import History, late_command, new_history
+from gridsim.sensing.imperfections import History, new_history
 from gridsim.sensing.observation import OWN_SPEED, normalise
-from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, START_FIELDS, STEERING, TRAFFIC_FIELDS, End
-from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
+from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, START_FIELDS, TRAFFIC_FIELDS, End
+from gridsim.step import look, obey, place, simulations_on, start_from, step, visit_cells
 
 _IDLE = int(End.IDLE)
 
@@ -119,7 +118,7 @@ def _keep(workspace, car, world, step):
 
 
 @njit
-def make_workspace(simulation, layers, rows, cars, command):
+def make_workspace(simulation, layers, rows, cars, command, history):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
     return Workspace(
         np.empty(CAR_FIELDS, dtype=np.float32),
@@ -130,7 +129,7 @@ def make_workspace(simulation, layers, rows, cars, command):
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
-        new_history(simulation.delays, simulation.constants.rays),
+        history,
         command,
     )
 
@@ -205,13 +204,11 @@ def _explore(recorder, steps, action, actions):
 
 
 @leaf
-def _act(constants, car, history, action, command):
-    """Acceleration (m/s2) and steering (rad) of an action, or of a command (pedal and wheel), late by `history`."""
+def _obey(constants, car, history, action, command):
+    """Acceleration (m/s2) and steering (rad) of an action, or of a command (pedal and wheel); see `step.obey`."""
     if command is None:
-        late, _ = late_command(history, car, F(action), ZERO, NEUTRAL)
-        return act(constants, I(late), car[SPEED], car[STEERING])
-    pedal, wheel = late_command(history, car, command[0], command[1], ZERO)
-    return act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
+        return obey(constants, car, history, True, F(action), ZERO)
+    return obey(constants, car, history, False, command[0], command[1])
 
 
 @leaf
@@ -221,7 +218,7 @@ def _drive(simulation, setup, car, workspace, world, action):
     As a `leaf`, this code is inlined without counting references to arrays. Written out in `run_episode`, it would
     count them, and drives among 8 cars would be 15 % slower.
     """
-    acceleration, steering = _act(simulation.constants, car, workspace.history, action, workspace.command)
+    acceleration, steering = _obey(simulation.constants, car, workspace.history, action, workspace.command)
     return step(simulation, car, workspace.visits, world, acceleration, steering, setup.target, setup.steps)
 
 
@@ -275,17 +272,19 @@ def run_episode(simulation, packed, layers, setup, workspace, world, grid_buffer
 
 @njit(nogil=True)
 def _rollout(
-    simulation, genomes, layers, setup, traffic, grid_buffers, command, rewind, notes, results, rewound,
+    simulation, genomes, layers, setup, traffic, world, grid_buffers, command, history, rewind, notes, results, rewound,
     rewound_worlds,
 ):  # fmt: skip
     """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
-    If rewind > 0, also fills rewound [n, 8] and rewound_worlds [n, cars, fields].
+    `world` is an array for a copy of the traffic, or None. If rewind > 0, also fills rewound [n, 8] and rewound_worlds
+    [n, cars, fields].
     """
-    workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0], command)
+    workspace = make_workspace(simulation, layers, rewind, rewound_worlds.shape[1], command, history)
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
-        world = None if traffic is None else traffic.copy()
+        if traffic is not None:
+            _copy_world(traffic, world)
         run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, None, notes, results[i])
         if rewind > 0:
             row_back = max(int(results[i]["steps"]) - rewind, 0) % rewind
@@ -296,21 +295,23 @@ def _rollout(
 
 @njit(nogil=True)
 def _collect(
-    simulation, genome, layers, which, starts, targets, steps, worlds, grid_buffers, command, epsilons, keys,
+    simulation, genome, layers, which, starts, targets, steps, worlds, grid_buffers, command, history, epsilons, keys,
     experience, results,
 ):  # fmt: skip
     """Drive a genome through episodes `which` [k] on one map; fills their rows of experience and results.
 
-    Args: experience [e, rows, ...]; starts, targets, steps, worlds, epsilons, keys and results [e, ...].
+    Args: experience [e, rows, ...]; starts, targets, steps, worlds, epsilons, keys and results [e, ...]. `worlds`, the
+    traffic at the episodes' starts or None, change.
     """
-    workspace = make_workspace(simulation, layers, 0, 0, command)
+    workspace = make_workspace(simulation, layers, 0, 0, command, history)
     packed = packed_genome(genome, layers, grid_buffers)
     observations, actions, rewards, ends = experience
     for k in which:
         setup = EpisodeSetup(starts[k], targets[k], steps[k])
-        world = None if worlds is None else worlds[k].copy()
         recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
-        run_episode(simulation, packed, layers, setup, workspace, world, grid_buffers, recorder, None, results[k])
+        run_episode(
+            simulation, packed, layers, setup, workspace, item(worlds, k), grid_buffers, recorder, None, results[k]
+        )
 
 
 def _check_steps(episodes: np.ndarray) -> None:
@@ -355,9 +356,11 @@ def evaluate(
             simulation = simulations_on([road_maps[episode["map"]]], config, spec.features, episode["start"])[0]
         setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
         traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
+        world = np.empty(worlds.shape[1:], dtype=np.float32) if worlds.shape[1] else None
+        history = new_history(simulation.delays, config.sensors.rays)
         row = kept[column]
         _rollout(
-            simulation, genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]), notes,
+            simulation, genomes, spec.layers, setup, traffic, world, *buffers, history, int(episode["rewind"]), notes,
             results[column], rewound[row], rewound_worlds[row],
         )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
@@ -384,7 +387,7 @@ def collect(
     buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config, spec.features)
     weights = freeze(weights.astype(np.float32, copy=False))
     setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))
-    traffic = freeze(worlds.copy()) if worlds.shape[1] else None
+    traffic = worlds.copy() if worlds.shape[1] else None
     exploration = freeze(epsilons.astype(np.float32)), freeze(keys.astype(np.uint64))
     results = np.zeros(len(episodes), dtype=RESULT)
     # Every episode has room for the rows of the longest time limit.
@@ -396,7 +399,11 @@ def collect(
         simulation = simulations[m]
         if config.randomise:
             simulation = simulations_on([road_maps[m]], config, spec.features, episodes["start"][group])[0]
-        _collect(simulation, weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results)
+        history = new_history(simulation.delays, config.sensors.rays)
+        _collect(
+            simulation, weights, spec.layers, which, *setups, traffic, *buffers, history, *exploration, experience,
+            results,
+        )  # fmt: skip
     driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
     return Experience(*(array[driven] for array in experience)), results
 
@@ -420,7 +427,8 @@ def trajectory(
     simulation = simulations_on([road_map], config, spec.features, start)[0]
     cars = 0 if world is None else len(world)
     grid_buffers, command = policy_buffers(spec, config)
-    workspace = make_workspace(simulation, spec.layers, steps + 1, cars, command)
+    history = new_history(simulation.delays, config.sensors.rays)
+    workspace = make_workspace(simulation, spec.layers, steps + 1, cars, command, history)
     world = world.copy() if world is not None and cars else None
     result = np.zeros(1, dtype=RESULT)
     packed = packed_genome(freeze(genome), spec.layers, grid_buffers)

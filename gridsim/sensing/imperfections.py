@@ -14,7 +14,7 @@ import numpy as np
 
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
-from gridsim.jit import ZERO, F, I, U, leaf, njit
+from gridsim.jit import ZERO, F, I, U, leaf
 from gridsim.state import STEPS, X, Y
 
 _SIDES = F(math.sqrt(3.0) / 1024.0)  # scales the sum of four whole numbers below 1,024 to a variance of 1
@@ -36,27 +36,35 @@ class Delays(NamedTuple):
 
 
 class History(NamedTuple):
-    """The latest readings and commands of a car, which take effect late.
+    """The latest readings and commands of a car, or of n cars, which take effect late.
 
     Ring buffers of as many steps as `Delays` (perhaps 0), indexed by the control step modulo their length.
     """
 
-    readings: np.ndarray  # float32 [steps, 2, rays], ranges and closing speeds
-    commands: np.ndarray  # float32 [steps, 2], action and 0, or pedal and wheel
+    readings: np.ndarray  # float32 [steps, 2, rays] or [n, ...], ranges and closing speeds
+    commands: np.ndarray  # float32 [steps, 2] or [n, ...], action and 0, or pedal and wheel
 
 
-def imperfections_of(config: SimConfig) -> tuple[Imperfections | None, Delays | None]:
-    """A configuration's imperfections, None without noise and dropouts, and its delays, None if both are 0 steps."""
+def imperfections_of(config: SimConfig, own: SimConfig) -> tuple[Imperfections | None, Delays | None]:
+    """Imperfections, None without noise and dropouts, and delays, None if no episode of the configuration has any.
+
+    Args: `own`, the configuration with the episode's vehicle (`SimConfig.drawn`).
+    """
     sensors, period, found = config.sensors, config.episode.control_period, None
     if sensors.noise or sensors.noise_share or sensors.dropout:
         found = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
-    delays = Delays(round(sensors.latency / period), round(config.vehicle.latency / period))
-    return found, delays if any(delays) else None
+    delays = Delays(round(sensors.latency / period), round(own.vehicle.latency / period))
+    # If each episode draws its latency, all have Delays, perhaps of 0 steps: else kernels would be compiled twice.
+    may_be_late = any(delays) or any(name == "latency" for name, *_ in config.randomise)
+    return found, delays if may_be_late else None
 
 
 @leaf
-def degrade(imperfections, reach, car, ranges):
-    """Add noise to ranges (m), clip them to [0, `reach`], and set the readings that drop out to `reach`."""
+def degrade(imperfections, reach, car, ranges, closing):
+    """Add noise to ranges (m), clip them to [0, `reach`], and have readings drop out.
+
+    The reading of a ray that drops out is `reach`, and 0 of its closing speed unless `closing` is empty.
+    """
     if imperfections is None:
         return
     place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre
@@ -67,16 +75,19 @@ def degrade(imperfections, reach, car, ranges):
         total = (bits & U(1023)) + (bits >> U(10) & U(1023)) + (bits >> U(20) & U(1023)) + (bits >> U(30) & U(1023))
         normal = (F(total) - F(2046.0)) * _SIDES
         noisy = ranges[r] + (imperfections.noise + imperfections.noise_share * ranges[r]) * normal
-        ranges[r] = reach if bits >> U(40) < imperfections.dropout else min(max(noisy, ZERO), reach)
+        ranges[r] = min(max(noisy, ZERO), reach)
+        if bits >> U(40) < imperfections.dropout:
+            ranges[r] = reach
+            if closing.shape[0] > 0:
+                closing[r] = ZERO
 
 
-@njit
-def new_history(delays, rays):
-    """The History of one car; None without delays."""
+def new_history(delays: Delays | None, rays: int, cars: tuple[int, ...] = ()) -> History | None:
+    """The History of one car, or of `cars` (n,); None without delays."""
     if delays is None:
         return None
-    readings = np.zeros((delays.readings, 2, rays), dtype=np.float32)
-    return History(readings, np.zeros((delays.commands, 2), dtype=np.float32))
+    shapes = (*cars, delays.readings, 2, rays), (*cars, delays.commands, 2)
+    return History(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
 
 
 @leaf

@@ -14,6 +14,8 @@ from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.simulator import Simulator
 from gridsim.state import DISTANCE, SPEED
+from gridsim.step import simulations_on
+from gridsim.traffic.world import spawn
 
 ALL = SimConfig(
     vehicle=VehicleConfig(latency=0.2),
@@ -61,6 +63,15 @@ def test_noise_and_dropout_have_their_sizes(road: Map) -> None:
     assert ((noisy >= 0.0) & (noisy <= 50.0)).all()
     one, next_one = error[:-1], error[1:]
     assert np.corrcoef(one, next_one)[0, 1] == pytest.approx(0.0, abs=0.02), "each reading has noise of its own"
+
+
+def test_a_ray_that_drops_out_sees_no_car(road: Map) -> None:
+    sim, starts = SimConfig(sensors=SensorConfig(dropout=0.5)), sample_starts(road, 50, np.random.default_rng(0))
+    simulator = Simulator(50, sim, traffic=8, features=("motion",))
+    simulator.reset(road, starts, worlds=spawn(road.network, starts, 8, np.arange(50, dtype=np.uint64), sim))
+    simulator.step(np.zeros(50, dtype=np.int64))
+    assert simulator.closing.any()
+    assert not simulator.closing[simulator.ranges == 50.0].any()
 
 
 def test_readings_and_commands_are_late_by_the_control_steps_of_their_latency(road: Map) -> None:
@@ -116,6 +127,15 @@ def test_vehicles_are_drawn_within_their_ranges_for_each_start(road: Map) -> Non
     wanted = [simulator.config.drawn(start).vehicle.acceleration for start in starts]
     np.testing.assert_allclose(simulator.cars[:, SPEED], 0.1 * np.array(wanted), rtol=1e-5)
     np.testing.assert_allclose(copy.cars[:, SPEED], 0.2 * np.array(wanted), rtol=1e-5)
+
+
+def test_all_episodes_have_delays_if_the_latency_is_drawn(road: Map) -> None:
+    """Else kernels would be compiled once more, by the first episode of the other kind."""
+    sim = replace(SimConfig(), randomise=(("latency", 0.0, 0.2),))
+    starts = [None, *sample_starts(road, 30, np.random.default_rng(0))]
+    delays = [simulations_on([road], sim, (), start)[0].delays for start in starts]
+    assert None not in delays
+    assert {each.commands for each in delays if each} == {0, 1, 2}
 
 
 @pytest.mark.parametrize(
