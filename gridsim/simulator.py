@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numba.core import event
 
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action
@@ -84,6 +86,21 @@ def _control_all(
         simulation = _on_map(physics, row)
         for i in order[first:last]:
             _control(simulation, i, discrete, commands, limits, ends, rewards, cars, visits, worlds, seen, histories)
+
+
+class _Notice(event.Listener):
+    """Says why a first `reset` takes so long; commands have their own notice (`cluster.workers.kernels`)."""
+
+    def on_start(self, event: Any) -> None:
+        if event.data["dispatcher"] is _place_all:
+            said = "compiling the simulator: up to a minute, once on a machine with traffic and once without"
+            logging.getLogger("gridsim").warning(said)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Notice())
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -65,8 +65,8 @@ class Simulation(NamedTuple):
     drivers: Drivers
     fan: np.ndarray  # directions of the rays (`rays.fan`)
     model: Any  # `Parameters` of the vehicle's model
-    imperfections: Imperfections | None  # None: no noise, no dropout
-    delays: Delays | None  # None: nothing is late
+    imperfections: Imperfections | None  # None, as delays: nothing is imperfect
+    delays: Delays | None
     encoding: Encoding
 
 

@@ -134,6 +134,16 @@ def curved() -> Iterator:
 
 
 @pytest.fixture
+def audited(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Commands that add a variable to their environment while threads may read it fail the test."""
+    late = tmp_path_factory.mktemp("audit") / "late"
+    monkeypatch.setenv("AUDIT", str(late))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "support/audit"), prepend=os.pathsep)
+    yield
+    assert not late.exists(), late.read_text()
+
+
+@pytest.fixture
 def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows that nobody sees."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")

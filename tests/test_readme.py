@@ -18,7 +18,7 @@ HERE = {
     'make dqn ARGS="--seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --name other",
     ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 1.2e8": "--car-steps 100000",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",
-    "make compare ARGS=--quick": f"{COMPARISON} quick",
+    "make compare ARGS=--quick": f"{COMPARISON} quick --learners evolution dqn --jobs 2 --workers 2",
     "make compare": f"{COMPARISON} whole",
     ".venv/bin/gridsim-compare runs/<name> runs/<other>": "",
     ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
@@ -112,6 +112,7 @@ def test_the_commands_of_tutorials_run(page: str, root: Path, tmp_path: Path) ->
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("audited")
 def test_the_commands_of_the_readme_run_and_then_the_examples_of_all_pages(root: Path, tmp_path: Path) -> None:
     run_all(HERE, root, tmp_path)
     for program in examples(root).values():

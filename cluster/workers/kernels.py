@@ -49,9 +49,8 @@ def _marker(settings: RunSettings) -> Path:
     road = "file" if is_map_file(settings.scenario) else file_name(label(settings.scenario))
     traffic = "traffic" if settings.traffic else "alone"
     sim = settings.simulator()
-    noisy, late = (part is not None for part in imperfections_of(sim, sim))
-    chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", "noisy": noisy, "late": late, OWN: has_own(settings)}
-    chosen["continuous"] = settings.policy.endswith(CONTINUOUS)
+    chosen = {sim.vehicle.model: sim.vehicle.model != "kinematic", OWN: has_own(settings)}
+    chosen |= {"imperfect": any(imperfections_of(sim, sim)), "continuous": settings.policy.endswith(CONTINUOUS)}
     special = "".join(f"{name}-" for name, there in chosen.items() if there)
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
     cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()

@@ -1,8 +1,8 @@
 """What real sensors and actuators do: noise, rays that miss what is there, and readings and commands that come late.
 
 A ray's noise and dropouts depend only on where the car is and on its control step, so they are the same for any number
-of workers. Without them, kernels get None instead of Imperfections, and Numba leaves their code out; likewise for
-Delays.
+of workers. Where nothing is imperfect, kernels get None in place of Imperfections and Delays, and Numba leaves their
+code out.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ class History(NamedTuple):
     commands: np.ndarray  # float32 [steps, 2] or [n, ...], action and 0, or pedal and wheel
 
 
-def imperfections_of(config: SimConfig, own: SimConfig) -> tuple[Imperfections | None, Delays | None]:
-    """Imperfections, None without noise and dropouts, and delays, None if no episode of the configuration has any.
+def imperfections_of(config: SimConfig, own: SimConfig) -> tuple[Imperfections, Delays] | tuple[None, None]:
+    """Imperfections and delays of an episode; None and None if no episode of the configuration has any.
 
-    Args: `own`, the configuration with the episode's vehicle (`SimConfig.drawn`).
+    Neither is None alone, or kernels would be compiled for each kind of imperfect car. Args: `own`, the configuration
+    with the episode's vehicle (`SimConfig.drawn`).
     """
-    sensors, period, found = config.sensors, config.episode.control_period, None
-    if sensors.noise or sensors.noise_share or sensors.dropout:
-        found = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
+    sensors, period = config.sensors, config.episode.control_period
+    noise = Imperfections(F(sensors.noise), F(sensors.noise_share), U(round(sensors.dropout * (1 << 24))))
     delays = Delays(round(sensors.latency / period), round(own.vehicle.latency / period))
-    # If each episode draws its latency, all have Delays, perhaps of 0 steps: else kernels would be compiled twice.
-    may_be_late = any(delays) or any(name == "latency" for name, *_ in config.randomise)
-    return found, delays if may_be_late else None
+    if any(noise) or any(delays) or any(name == "latency" for name, *_ in config.randomise):
+        return noise, delays
+    return None, None
 
 
 @leaf
@@ -66,6 +66,8 @@ def degrade(imperfections, reach, car, ranges, closing):
     The reading of a ray that drops out is `reach`, and 0 of its closing speed unless `closing` is empty.
     """
     if imperfections is None:
+        return
+    if imperfections.noise + imperfections.noise_share == ZERO and imperfections.dropout == 0:
         return
     place = U(I(car[X] * F(4096.0))) << U(32) ^ U(I(car[Y] * F(4096.0)))  # to a quarter of a millimetre
     key = mix(mix(place) + U(I(car[STEPS])))

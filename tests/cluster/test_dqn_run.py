@@ -24,7 +24,7 @@ NOT_OF_THE_CLOCK = ("distance_m/best", "distance_m/mean", "loss", "q/mean", "q/c
 pytestmark = pytest.mark.e2e
 
 
-@pytest.mark.usefixtures("database")
+@pytest.mark.usefixtures("database", "audited")
 def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
     with running("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path) as process:

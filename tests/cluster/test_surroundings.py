@@ -12,17 +12,16 @@ from pathlib import Path
 
 import pytest
 import tracked
-from commands import BIN, finish, rows, running, same_run, wait_until
+from commands import BIN, all_in_mlflow, finish, rows, running, wait_until
 
 from gridsim.jit import CACHE_FOLDER
 
 SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "30", "--seed", "5"]
-REFERENCE = ("gridsim-evolve", *SMALL)
 pytestmark = pytest.mark.e2e
 
 
 @pytest.mark.usefixtures("database")
-def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(reference: Path, tmp_path: Path) -> None:
+def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
     run, (ours, theirs) = tmp_path / "runs/r", pty.openpty()
     command = [str(BIN / "gridsim-evolve"), *SMALL, "--workers", "0", "--name", "r"]
     with subprocess.Popen(
@@ -46,7 +45,7 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(reference: Path, tmp_path:
     assert logged.status == "KILLED"
     assert len(rows(run)) < 30
     finish("gridsim-evolve", "--workers", "0", "--resume", "runs/r", cwd=tmp_path)
-    assert same_run(run, reference)
+    assert all_in_mlflow(run)
 
 
 @pytest.mark.usefixtures("database")
@@ -64,7 +63,7 @@ def test_a_run_is_closed_when_what_reads_its_output_is_interrupted_with_it(tmp_p
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
-def test_neither_a_home_nor_a_users_name_is_needed(reference: Path, empty_database: Path) -> None:
+def test_neither_a_home_nor_a_users_name_is_needed(empty_database: Path) -> None:
     """As on OpenShift, with HTCondor, in systemd's units. It keeps root's right to read, as Python may lie in /root."""
     user = ["/usr/bin/setpriv", "--reuid", "54321", "--regid", "54321", "--clear-groups", "--no-new-privs"]
     user += ["--inh-caps", "+dac_read_search", "--ambient-caps", "+dac_read_search"]
@@ -78,32 +77,4 @@ def test_neither_a_home_nor_a_users_name_is_needed(reference: Path, empty_databa
         assert finish(*command, "--help", cwd=folder).stdout.startswith("usage: gridsim-evolve")
         done = finish(*command, *SMALL, "--workers", "0", "--name", "r", cwd=folder)
         assert done.stderr == ""
-        assert same_run(Path(folder, "runs/r"), reference)
-
-
-AUDIT = """
-import os, sys, threading
-known = set(os.environ)
-
-def hook(event, arguments):
-    if event == "os.unsetenv":
-        known.discard(os.fsdecode(arguments[0]))
-    elif event == "os.putenv" and (name := os.fsdecode(arguments[0])) not in known:
-        known.add(name)
-        # MLflow's thread does nothing but read from a pipe.
-        threads = {thread.name for thread in threading.enumerate()} - {"MainThread", "mlflow"}
-        if threads and "gridsim-" in " ".join(sys.argv):
-            with open(__file__ + ".late", "a") as file:
-                print(sys.argv[0], name, file=file)
-
-sys.addaudithook(hook)
-"""
-
-
-def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path) -> None:
-    """A new variable may move the environment while another thread is in `getenv`, which crashes the process."""
-    (tmp_path / "sitecustomize.py").write_text(AUDIT)
-    flags = "--scenarios curved --learners evolution dqn --seeds 1 --budget 10k --name c --jobs 2 --workers 2"
-    finish("gridsim-compare", *flags.split(), cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    late = tmp_path / "sitecustomize.py.late"
-    assert not late.exists(), late.read_text()
+        assert all_in_mlflow(Path(folder, "runs/r"))

@@ -62,9 +62,19 @@ def make_ui(root, folder, port):
                 os.killpg(ui.pid, signal.SIGINT)
 
 
+def check_end(port, tell):
+    """All processes of `make ui` end within seconds once `make` is told to."""
+    (made,) = [each for each in psutil.process_iter(["cmdline"]) if (each.info["cmdline"] or [])[:1] == ["make"]
+               and f"PORT={port}" in each.info["cmdline"]]  # fmt: skip
+    left = made.children(recursive=True)
+    assert len(left) >= 3  # the command, MLflow, and its workers
+    tell(made)
+    assert not psutil.wait_procs(left, 15)[1]
+
+
 @pytest.mark.e2e
 @needs_chromium
-def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
+def test_the_link_leads_to_the_run_table_and_its_curves_until_the_terminal_is_closed(uri, root, tmp_path):
     folder = tmp_path / "store"
     logged(uri, tmp_path, "first", 0.875)
     logged(uri, tmp_path, "second", 0.625)
@@ -94,6 +104,7 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
         events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": "application/json"})
         with urllib.request.urlopen(events, timeout=20) as answer:
             assert json.load(answer) == {"status": "disabled"}
+        check_end(port, lambda made: os.killpg(made.pid, signal.SIGHUP))  # a closed terminal
 
 
 def test_a_port_in_use_is_one_line(tmp_path):
@@ -105,8 +116,7 @@ def test_a_port_in_use_is_one_line(tmp_path):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("who", ["make", "a closed terminal"])
-def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch, who):
+def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch):
     for name in ("http_proxy", "https_proxy", "ALL_PROXY"):  # where nobody answers
         monkeypatch.setenv(name, "http://127.0.0.1:1")
     for name in ("no_proxy", "NO_PROXY"):
@@ -114,12 +124,4 @@ def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path
     logged(uri, tmp_path, "first", 0.875)
     with make_ui(root, tmp_path / "store", port := free_port()) as link:
         assert link.startswith(f"http://127.0.0.1:{port}/#/experiments/")
-        (made,) = [each for each in psutil.process_iter(["cmdline"]) if (each.info["cmdline"] or [])[:1] == ["make"]
-                   and f"PORT={port}" in each.info["cmdline"]]  # fmt: skip
-        left = made.children(recursive=True)
-        assert len(left) >= 3  # the command, MLflow, and its workers
-        if who == "a closed terminal":
-            os.killpg(made.pid, signal.SIGHUP)
-        else:
-            made.send_signal(signal.SIGTERM)
-        assert not psutil.wait_procs(left, 15)[1]
+        check_end(port, lambda made: made.send_signal(signal.SIGTERM))
