@@ -163,7 +163,7 @@ def exact(function: Callable[..., Any]) -> Callable[..., Any]:
     return leaf(function, fastmath=False)
 
 
-def _item(typingctx, arrays, i):
+def _row_of(typingctx, arrays, i):
     """For kernels: `arrays[i]`; the same of each array in a named tuple; None of None.
 
     Numba knows which of these when it compiles. Of `None if arrays is None else arrays[i]` it would make an optional
@@ -189,7 +189,7 @@ def _item(typingctx, arrays, i):
     return result(arrays, i), codegen
 
 
-item: Any = intrinsic(_item)
+row_of: Any = intrinsic(_row_of)
 
 
 def freeze(array: np.ndarray) -> np.ndarray:

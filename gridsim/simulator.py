@@ -12,7 +12,7 @@ from numba.core import event
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig, constants
-from gridsim.jit import item, leaf, njit
+from gridsim.jit import leaf, njit, row_of
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
 from gridsim.sensing.imperfections import Delays, History, new_history
@@ -39,7 +39,7 @@ def _on_map(physics, row):
 def _look(simulation, i, cars, worlds, seen, histories):
     """Have car i look around; args as in `_control_all`."""
     ranges, closing, observations = seen
-    look(simulation, cars[i], item(worlds, i), ranges[i], closing[i], observations[i], item(histories, i))
+    look(simulation, cars[i], row_of(worlds, i), ranges[i], closing[i], observations[i], row_of(histories, i))
 
 
 @leaf
@@ -48,9 +48,9 @@ def _control(simulation, i, discrete, commands, limits, ends, rewards, cars, vis
     constants, car = simulation.constants, cars[i]
     before, runs_on = car[DISTANCE], ends[i] == 0
     if runs_on:
-        history = item(histories, i)
+        history = row_of(histories, i)
         acceleration, steering = obey(constants, car, history, discrete, commands[i, 0], commands[i, 1])
-        ends[i] = step(simulation, car, visits[i], item(worlds, i), acceleration, steering, *limits)
+        ends[i] = step(simulation, car, visits[i], row_of(worlds, i), acceleration, steering, *limits)
     _look(simulation, i, cars, worlds, seen, histories)
     if runs_on:
         gained, fastest = car[DISTANCE] - before, simulation.road.speed_high
@@ -89,11 +89,13 @@ def _control_all(
 
 
 class _Notice(event.Listener):
-    """Says why a first `reset` takes so long; commands have their own notice (`cluster.workers.kernels`)."""
+    """Says why a first `reset` and `step` take so long. Commands that train say so themselves (`cluster.run`)."""
 
     def on_start(self, event: Any) -> None:
-        if event.data["dispatcher"] is _place_all:
-            said = "compiling the simulator: up to a minute, once on a machine with traffic and once without"
+        if (event.data or {}).get("dispatcher") is _place_all:
+            said = (
+                "compiling the simulator: the first reset and step take up to a minute, later ones of this kind do not"
+            )
             logging.getLogger("gridsim").warning(said)
 
     def on_end(self, event: Any) -> None:
@@ -213,7 +215,7 @@ class Simulator:
         self._row_of = {}
 
     def _arrays(self, physics: Physics) -> tuple[Any, ...]:
-        """State of all cars as kernels read it; worlds are None without traffic, histories without delays."""
+        """State of all cars as kernels read it; worlds are None without traffic, histories if nothing is imperfect."""
         worlds, seen = self.worlds if self.worlds.shape[1] else None, (self.ranges, self.closing, self.observations)
         histories = None
         *_, delays, _ = physics[1]
@@ -307,9 +309,9 @@ def views(
 
 
 def _commands(actions: np.ndarray) -> tuple[bool, np.ndarray]:
-    """Whether actions are discrete [n] or continuous [n, 2], and the commands of `step.obey`, float32 [n, 2].
+    """True for discrete actions [n], False for continuous ones [n, 2]; and the commands of `step.obey`, float32 [n, 2].
 
-    Both kinds have one type, or kernels would be compiled twice. Raises: ValueError.
+    Commands of both kinds have one type, or kernels would be compiled twice. Raises: ValueError.
     """
     array = np.asarray(actions)
     if array.ndim == 2:
@@ -319,4 +321,6 @@ def _commands(actions: np.ndarray) -> tuple[bool, np.ndarray]:
     wrong = (array < 0) | (array >= len(Action)) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
     if wrong.any():
         raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {array[wrong][0]}")
-    return True, np.stack([array, np.zeros_like(array)], axis=1, dtype=np.float32, casting="unsafe")
+    commands = np.zeros((len(array), 2), dtype=np.float32)
+    commands[:, 0] = array
+    return True, commands

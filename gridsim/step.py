@@ -1,6 +1,6 @@
 """A control step: traffic moves, the ego car drives, collides, gains new ground or ends its episode, and looks around.
 
-Everything that drives cars is a loop over `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
+Everything that drives cars is a loop over `obey`, `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
 A `world` is the state of the other cars (`traffic.world`). In kernels, None means that there are none: Numba then
 leaves out the code for traffic.
 """
@@ -65,7 +65,7 @@ class Simulation(NamedTuple):
     drivers: Drivers
     fan: np.ndarray  # directions of the rays (`rays.fan`)
     model: Any  # `Parameters` of the vehicle's model
-    imperfections: Imperfections | None  # None, as delays: nothing is imperfect
+    imperfections: Imperfections | None  # None, and so are delays, if nothing is imperfect
     delays: Delays | None
     encoding: Encoding
 

@@ -75,11 +75,12 @@ def test_a_clean_environment_drives_and_says_what_else_needs(built: Path, tmp_pa
     assert sum(path.stat().st_size for path in files) < MOST_MB * 2**20
 
     def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        own = os.environ | {"GRIDSIM_CACHE_DIR": str(tmp_path / "cache")}  # where no kernels are
+        return subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, timeout=300)
 
     driven = run(python, "-c", DRIVE)
     assert driven.returncode == 0, driven.stderr
-    assert driven.stderr.startswith("compiling the simulator: up to a minute")
+    assert driven.stderr.startswith("compiling the simulator: ")
     for code, extra in WITHOUT_EXTRAS.items():
         line = run(python, "-c", code).stderr.splitlines()[-1]
         assert line.startswith(f'gridsim.errors.GridSimError: pip install "{PROJECT["project"]["name"]}[{extra}]" ')

@@ -20,7 +20,7 @@ from gridsim.car.reward import reward
 from gridsim.config import MOST_STEPS, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import ZERO, F, U, exact, freeze, item, leaf, njit
+from gridsim.jit import ZERO, F, U, exact, freeze, leaf, njit, row_of
 from gridsim.maps.map import Map
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.imperfections import History, new_history
@@ -90,7 +90,7 @@ class Workspace(NamedTuple):
     scratch: np.ndarray  # float32, buffer of a perceptron's forward pass
     ring: np.ndarray  # float32 [n, CAR_FIELDS], the car before each of the last n steps: step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the traffic before each of these steps, in the same rows
-    history: History | None  # None if neither readings nor commands are late
+    history: History | None  # None if nothing is imperfect
     command: np.ndarray | None  # float32 [2], pedal and wheel; None for a policy with discrete actions
 
 
@@ -310,7 +310,7 @@ def _collect(
         setup = EpisodeSetup(starts[k], targets[k], steps[k])
         recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
         run_episode(
-            simulation, packed, layers, setup, workspace, item(worlds, k), grid_buffers, recorder, None, results[k]
+            simulation, packed, layers, setup, workspace, row_of(worlds, k), grid_buffers, recorder, None, results[k]
         )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
-from commands import BIN, all_in_mlflow, command_line, descendants, finish, rows, running, wait_until
+from commands import BIN, command_line, descendants, finish, rows, running, same_run, wait_until
 from test_pool import Answering, drive_task, make_recipes, never_built
 
 from cluster.workers import ray_pool
@@ -23,6 +23,7 @@ from cluster.workers.ray_session import OWN_ENVIRONMENT
 from cluster.workers.worker import Worker
 
 SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "20", "--seed", "5"]
+REFERENCE = ("gridsim-evolve", *SMALL)
 ON_LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
 
 
@@ -165,7 +166,7 @@ def test_a_ray_that_was_imported_too_early_for_a_token_is_refused(tmp_path: Path
 
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")
-def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(tmp_path: Path) -> None:
+def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(reference: Path, tmp_path: Path) -> None:
     run, command = tmp_path / "runs/r", ["gridsim-evolve", *SMALL, "--name", "r", "--resume-if-exists", "--workers"]
     for lost in ("raylet", "gcs_server"):
         done = len(rows(run))
@@ -186,7 +187,7 @@ def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(tmp_pat
         (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
         assert logged.status == "FAILED"
     finish(*command, "0", cwd=tmp_path)
-    assert all_in_mlflow(run)
+    assert same_run(run, reference)
 
 
 @pytest.mark.e2e

@@ -45,6 +45,7 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
     assert logged.status == "KILLED"
     assert len(rows(run)) < 30
     finish("gridsim-evolve", "--workers", "0", "--resume", "runs/r", cwd=tmp_path)
+    assert len(rows(run)) == 30
     assert all_in_mlflow(run)
 
 

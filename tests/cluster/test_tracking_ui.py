@@ -74,7 +74,7 @@ def check_end(port, tell):
 
 @pytest.mark.e2e
 @needs_chromium
-def test_the_link_leads_to_the_run_table_and_its_curves_until_the_terminal_is_closed(uri, root, tmp_path):
+def test_the_link_leads_to_the_run_table_and_its_curves_until_make_is_ended(uri, root, tmp_path):
     folder = tmp_path / "store"
     logged(uri, tmp_path, "first", 0.875)
     logged(uri, tmp_path, "second", 0.625)
@@ -104,7 +104,7 @@ def test_the_link_leads_to_the_run_table_and_its_curves_until_the_terminal_is_cl
         events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": "application/json"})
         with urllib.request.urlopen(events, timeout=20) as answer:
             assert json.load(answer) == {"status": "disabled"}
-        check_end(port, lambda made: os.killpg(made.pid, signal.SIGHUP))  # a closed terminal
+        check_end(port, lambda made: made.send_signal(signal.SIGTERM))
 
 
 def test_a_port_in_use_is_one_line(tmp_path):
@@ -116,7 +116,7 @@ def test_a_port_in_use_is_one_line(tmp_path):
 
 
 @pytest.mark.e2e
-def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch):
+def test_a_closed_terminal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch):
     for name in ("http_proxy", "https_proxy", "ALL_PROXY"):  # where nobody answers
         monkeypatch.setenv(name, "http://127.0.0.1:1")
     for name in ("no_proxy", "NO_PROXY"):
@@ -124,4 +124,4 @@ def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path
     logged(uri, tmp_path, "first", 0.875)
     with make_ui(root, tmp_path / "store", port := free_port()) as link:
         assert link.startswith(f"http://127.0.0.1:{port}/#/experiments/")
-        check_end(port, lambda made: made.send_signal(signal.SIGTERM))
+        check_end(port, lambda made: os.killpg(made.pid, signal.SIGHUP))

@@ -29,6 +29,9 @@ ALL = SimConfig(
 )
 
 
+ONE_BY_ONE = [SensorConfig(**{name: 0.1}) for name in ("noise", "noise_share", "dropout", "latency")]  # type: ignore[arg-type]
+
+
 @pytest.fixture(scope="module")
 def road() -> Map:
     return build("curved", 1)
@@ -136,6 +139,14 @@ def test_all_episodes_have_delays_if_the_latency_is_drawn(road: Map) -> None:
     delays = [simulations_on([road], sim, (), start)[0].delays for start in starts]
     assert None not in delays
     assert {each.commands for each in delays if each} == {0, 1, 2}
+
+
+def test_imperfections_of_any_kind_have_the_same_kernels(road: Map) -> None:
+    for sim in (SimConfig(VehicleConfig(latency=0.2)), *(SimConfig(sensors=each) for each in ONE_BY_ONE)):
+        simulation = simulations_on([road], sim)[0]
+        assert None not in (simulation.imperfections, simulation.delays), sim
+    perfect = simulations_on([road], SimConfig())[0]
+    assert (perfect.imperfections, perfect.delays) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import EpisodeConfig, SimConfig, VehicleConfig, constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.simulator import Simulator
+from gridsim.simulator import Simulator, _control_all
 from gridsim.state import COS, DISTANCE, IDLE, LANE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.traffic.world import spawn
 
@@ -90,6 +90,15 @@ def test_a_period_is_the_oracles(speed, steering, heading, action):
     assert (float(x), float(y)) == pytest.approx((looks[-1, 0], looks[-1, 1]), abs=tolerance)
     assert float(after) == pytest.approx(looks[-1, 3], abs=1e-5)
     assert abs(math.remainder(math.atan2(sine, cosine) - looks[-1, 2], 2 * math.pi)) < tolerance
+
+
+def test_discrete_and_continuous_actions_have_one_kernel():
+    simulator, road = Simulator(1), build("curved", 1)
+    simulator.reset(road, sample_starts(road, 1, np.random.default_rng(0)))
+    simulator.step(np.array([Action.ACCELERATE]))
+    kinds = len(_control_all.signatures)
+    simulator.step(np.array([[1.0, 0.0]]))
+    assert len(_control_all.signatures) == kinds
 
 
 # --- Episodes --------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Python imports this at its start if this folder is on PYTHONPATH (the fixture `audited`).
 
-It writes a line to the file AUDIT names whenever a command adds a variable to its environment while other threads may
+It writes a line to the file that the variable AUDIT names whenever a command adds a variable to its environment while other threads may
 read it: a new variable may move the environment while another thread is in `getenv`, which crashes the process.
 """
 
@@ -18,7 +18,7 @@ def _hook(event: str, arguments: tuple) -> None:
         _known.add(name)
         # MLflow's thread does nothing but read from a pipe.
         threads = {thread.name for thread in threading.enumerate()} - {"MainThread", "mlflow"}
-        if threads and "gridsim-" in " ".join(sys.argv):
+        if threads and os.path.basename(sys.argv[0]).startswith("gridsim-"):  # MLflow's process has a run's sys.argv
             with open(os.environ["AUDIT"], "a") as file:
                 print(sys.argv[0], name, file=file)
 
