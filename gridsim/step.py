@@ -1,8 +1,8 @@
 """A control step: traffic moves, the ego car drives, collides, gains new ground or ends its episode, and looks around.
 
-Everything that drives cars is a loop over `obey`, `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
-A `world` is the state of the other cars (`traffic.world`). In kernels, None means that there are none: Numba then
-leaves out the code for traffic.
+Everything that drives cars is a loop over `obey`, `step` and `look`: `gridsim.simulator` and
+`evolution.episodes.rollout`. A `world` is the state of the other cars (`traffic.world`). In kernels, None means that
+there are none: Numba then leaves out the code for traffic.
 """
 
 from __future__ import annotations

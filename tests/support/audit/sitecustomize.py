@@ -1,7 +1,8 @@
 """Python imports this at its start if this folder is on PYTHONPATH (the fixture `audited`).
 
-It writes a line to the file that the variable AUDIT names whenever a command adds a variable to its environment while other threads may
-read it: a new variable may move the environment while another thread is in `getenv`, which crashes the process.
+Whenever a command adds a variable to its environment while other threads may read it, this writes a line to the file
+that the variable AUDIT names: a new variable may move the environment while another thread is in `getenv`, which
+crashes the process.
 """
 
 import os
