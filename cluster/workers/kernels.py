@@ -40,7 +40,7 @@ from gridsim.state import CAR_FIELDS
 from gridsim.traffic.world import spawn
 
 OWN = "fitness"  # says in a marker's name and on a command line that the run has a fitness of the user's own
-PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
+PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and looks around on them
 
 
 def _marker(settings: RunSettings) -> Path:
@@ -104,6 +104,8 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
             Worker().answer(
                 CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
             )
+        # After these, with which it shares most kernels; in the other process it would compile them at the same time.
+        trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
         return
     for seed in range(len(roads_of(scenario))):
         built = build(scenario, seed, config)
@@ -111,8 +113,6 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
     cars = np.zeros((1, CAR_FIELDS), dtype=np.float32)
     views(road, cars, worlds, config, spec.features)
     clearances(road.road, freeze(cars[:, :2]))
-    # This comes last, so that it finds in the cache what the process of the other part has compiled by then.
-    trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
 
 
 def everything_by_default() -> list[RunSettings]:
