@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import get_type_hints
 
+import gymnasium
 import matplotlib.font_manager  # noqa: F401 - finds the fonts, or the notebook would, and warn
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
@@ -15,6 +16,8 @@ from sphinx.ext.napoleon import GoogleDocstring
 
 import gridsim
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+
+gymnasium.make("GridSim/Curved-v0").reset()  # compiles what environments need, or the notebook would, and say so
 
 project = "GridSim"
 author = project_copyright = "The GridSim contributors"
