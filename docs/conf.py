@@ -17,7 +17,8 @@ from sphinx.ext.napoleon import GoogleDocstring
 import gridsim
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 
-gymnasium.make("GridSim/Curved-v0").reset()  # compiles what environments need, or the notebook would, and say so
+# Compiles for environments now; else the notebook would, and show the notice of it on its page.
+gymnasium.make("GridSim/Curved-v0").reset()
 
 project = "GridSim"
 author = project_copyright = "The GridSim contributors"

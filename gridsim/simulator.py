@@ -93,7 +93,7 @@ class _Notice(event.Listener):
 
     def on_start(self, event: Any) -> None:
         if (event.data or {}).get("dispatcher") is _place_all:
-            said = "compiling the simulator: a first reset and step of this kind take up to a minute, later ones do not"
+            said = "compiling the simulator for drives of this kind, once (first reset and step: up to a minute)"
             logging.getLogger("gridsim").warning(said)
 
     def on_end(self, event: Any) -> None:

@@ -80,7 +80,7 @@ def test_a_clean_environment_drives_and_says_what_else_needs(built: Path, tmp_pa
 
     driven = run(python, "-c", DRIVE)
     assert driven.returncode == 0, driven.stderr
-    assert driven.stderr.startswith("compiling the simulator: ")
+    assert driven.stderr.startswith("compiling the simulator for drives of this kind, once")
     for code, extra in WITHOUT_EXTRAS.items():
         line = run(python, "-c", code).stderr.splitlines()[-1]
         assert line.startswith(f'gridsim.errors.GridSimError: pip install "{PROJECT["project"]["name"]}[{extra}]" ')

@@ -104,7 +104,7 @@ def compile_part(part: str, scenario: str, sim: str, policy: str, traffic: int, 
             Worker().answer(
                 CollectTask(*shared, genome, np.zeros(1, dtype=np.float32), keys), [road], made, slice(0, 1)
             )
-        # After these, with which it shares most kernels; in the other process it would compile them at the same time.
+        # It needs most of the kernels that are compiled by now; the process of the other part would compile them again.
         trajectory(spec, genome, road, episodes["start"][0], 1.0, 1, config, worlds[0])
         return
     for seed in range(len(roads_of(scenario))):

@@ -85,7 +85,7 @@ def degrade(imperfections, reach, car, ranges, closing):
 
 
 def new_history(delays: Delays | None, rays: int, cars: tuple[int, ...] = ()) -> History | None:
-    """The History of one car, or of `cars` (n,); None without delays."""
+    """The History of one car, or of n cars if `cars` is (n,); None without delays."""
     if delays is None:
         return None
     shapes = (*cars, delays.readings, 2, rays), (*cars, delays.commands, 2)

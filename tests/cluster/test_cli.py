@@ -49,7 +49,7 @@ def test_ctrl_c_in_every_phase_saves_and_leaves_nothing_behind(reference, tmp_pa
     run = tmp_path / "runs/c"
     command = [BIN / "gridsim-evolve", "--workers", workers, "--name", "c", "--resume-if-exists", *SMALL]
     for phase, begun in PHASES.items():
-        if workers == "0" and phase in ("compiling", "starting Ray"):  # compiling needs no workers, and these no Ray
+        if workers == "0" and phase in ("compiling", "starting Ray"):  # no Ray; compiling is the same with workers
             continue
         log, early = tmp_path / f"{phase}.log", phase in ("compiling", "starting Ray")
         environment = os.environ | ({"GRIDSIM_CACHE_DIR": str(tmp_path / "cache")} if phase == "compiling" else {})

@@ -29,9 +29,6 @@ ALL = SimConfig(
 )
 
 
-ONE_BY_ONE = [SensorConfig(**{name: 0.1}) for name in ("noise", "noise_share", "dropout", "latency")]  # type: ignore[arg-type]
-
-
 @pytest.fixture(scope="module")
 def road() -> Map:
     return build("curved", 1)
@@ -142,7 +139,8 @@ def test_all_episodes_have_delays_if_the_latency_is_drawn(road: Map) -> None:
 
 
 def test_imperfections_of_any_kind_have_the_same_kernels(road: Map) -> None:
-    for sim in (SimConfig(VehicleConfig(latency=0.2)), *(SimConfig(sensors=each) for each in ONE_BY_ONE)):
+    alone = SensorConfig(noise=0.1), SensorConfig(noise_share=0.1), SensorConfig(dropout=0.1), SensorConfig(latency=0.1)
+    for sim in (SimConfig(VehicleConfig(latency=0.2)), *(SimConfig(sensors=each) for each in alone)):
         simulation = simulations_on([road], sim)[0]
         assert None not in (simulation.imperfections, simulation.delays), sim
     perfect = simulations_on([road], SimConfig())[0]
